@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ucfrec.reporting.charts import OURS, PAGE, PLAIN, file_style, save
@@ -37,7 +36,8 @@ def draw(files: Mapping[str, Sequence[ResultRow]], order: Sequence[str], folder:
 
 
 def _panels(rows: Sequence[ResultRow], by: str, label: str, folder: Path, name: str) -> None:
-    """A panel of bars for each value of the field `by`, three in a line."""
+    """A panel for each value of the field `by`, three in a line: a bar a method, the first on top,
+    UCF in its color."""
     groups = grouped(rows, lambda row: str(getattr(row, by)).removesuffix("-zoo"))
     methods = list(dict.fromkeys(row.method for row in rows))
     lines = -(-len(groups) // 3)
@@ -46,7 +46,16 @@ def _panels(rows: Sequence[ResultRow], by: str, label: str, folder: Path, name: 
     for axes, title in zip(panels, groups, strict=False):
         axes.set_title(title)
         axes.tick_params(axis="y", labelsize=5)
-        _bars(axes, groups[title], methods)
+        of = grouped(groups[title], lambda row: row.method)
+        found = {name: summary(row.value for row in of.get(name, ())) for name in methods[::-1]}
+        ours = [n == "ucf" or n.startswith(("ucf-x", "ucf-wo-count")) for n in found]
+        axes.barh(
+            list(found),
+            [each.mean if each.count else 0.0 for each in found.values()],
+            xerr=[each.sd if each.count > 1 else 0.0 for each in found.values()],
+            color=[OURS if is_ours else PLAIN for is_ours in ours],
+            height=0.7,
+        )
     for axes in panels[len(groups) :]:
         axes.set_visible(False)
     figure.supxlabel(label, fontsize=8)
@@ -71,19 +80,3 @@ def _checkpoints(rows: Sequence[ResultRow], folder: Path, name: str) -> None:
     panels[0].set_ylabel("normalized score")
     panels[0].legend(loc="best")
     save(figure, folder, name)
-
-
-def _bars(axes: Axes, rows: Sequence[ResultRow], methods: Sequence[str]) -> None:
-    """A horizontal bar per method, the first on top, UCF in its color."""
-    of = grouped(rows, lambda row: row.method)
-    found = {name: summary(row.value for row in of.get(name, ())) for name in methods[::-1]}
-    axes.barh(
-        list(found),
-        [each.mean if each.count else 0.0 for each in found.values()],
-        xerr=[each.sd if each.count > 1 else 0.0 for each in found.values()],
-        color=[
-            OURS if name == "ucf" or name.startswith(("ucf-x", "ucf-wo-count")) else PLAIN
-            for name in found
-        ],
-        height=0.7,
-    )

@@ -8,10 +8,11 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files, table_name
 
+Resolved = tuple[tuple[Path, ...], LogMapping]
+"""The logs among some paths, and the mapping with that of their data set."""
 
-def _resolve(
-    paths: Sequence[str | Path], mapping: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+
+def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     """Files and folders called `items.*` and `users.*`, and those that the mapping names as
     features, are feature tables, all others logs."""
     files = log_files(paths)

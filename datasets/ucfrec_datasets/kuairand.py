@@ -6,7 +6,7 @@ from typing import Final
 
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, LogMapping, Release, log_files
-from ucfrec_datasets.generic import official_table
+from ucfrec_datasets.generic import Resolved, official_table
 
 LOGS: Final = ("log_standard_", "log_random_")
 FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
@@ -65,9 +65,7 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(
-    paths: Sequence[str | Path], mapping: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     """All given logs, with user and basic video features of the same paths or the logs' folder.
 
     Logs may have any name if none is called as in the releases.

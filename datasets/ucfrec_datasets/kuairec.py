@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.logs.mapping import Dataset, LogMapping, Release
-from ucfrec_datasets.generic import official_files, official_table
+from ucfrec_datasets.generic import Resolved, official_files, official_table
 from ucfrec_datasets.kuairand import PROFILE
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
@@ -35,9 +35,7 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(
-    paths: Sequence[str | Path], mapping: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     """The given matrices, or `big_matrix` of a given folder, with features of the logs' folder.
 
     `small_matrix` is read only if a path names it, because the `kuairec` simulator is made from it.

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.logs.mapping import Dataset, LogMapping, Release
-from ucfrec_datasets.generic import official_files, official_table
+from ucfrec_datasets.generic import Resolved, official_files, official_table
 
 RATINGS, MOVIES, USERS = "ratings", "movies", "users"
 GENRES: Final = (
@@ -26,9 +26,7 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(
-    paths: Sequence[str | Path], mapping: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     """The ratings, with genres and users of the same paths or of the ratings' folder."""
     logs, files = official_files(paths, RATINGS, (MOVIES, USERS))
     defaults = LogMapping(

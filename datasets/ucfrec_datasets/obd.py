@@ -7,6 +7,7 @@ from typing import Final
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import SUFFIXES, Dataset, FeatureTable, LogMapping, Release, log_files
+from ucfrec_datasets.generic import Resolved
 
 CAMPAIGNS: Final = ("all", "men", "women")
 """Each has items of its own, which it numbers from 0."""
@@ -31,9 +32,7 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(
-    paths: Sequence[str | Path], mapping: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     """Logs of one campaign, with item features of the same paths or of the first log's folder.
 
     Items are called `<campaign>/<number>`, so that no run of one campaign reads the logs of another

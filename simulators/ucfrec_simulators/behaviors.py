@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from ucfrec.acting.rollout import Actor, Memoryless
-from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 
 
 def truncated_normal(
@@ -30,18 +30,9 @@ def truncated_normal(
     below, above = ndtr((-1 - center) / scale), ndtr((1 - center) / scale)
     quantile = below + generator.random(center.shape) * (above - below)
     actions = np.clip(center + scale * ndtri(quantile), -1, 1).astype(np.float32)
-    return actions, truncated_normal_density(mean, scale, actions).astype(np.float32)
-
-
-def truncated_normal_density(
-    mean: Float32Array, scale: float, actions: Float32Array
-) -> Float64Array:
-    """Densities (N,) of actions (N, A) under the distribution of `truncated_normal`."""
-    center = mean.astype(np.float64)
-    inside = ndtr((1 - center) / scale) - ndtr((-1 - center) / scale)
     deviation = (actions - center) / scale
-    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * inside)
-    return np.asarray(np.exp(logarithm.sum(axis=1)))
+    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
+    return actions, np.exp(logarithm.sum(axis=1)).astype(np.float32)
 
 
 class Rule(Memoryless):

@@ -23,6 +23,7 @@ from ucfrec.episodes.writer import read_observations, reward_bit, write_observat
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec_simulators.kuai import kuairand
+from ucfrec_simulators.session_env import AnyEnv
 from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 
 OFF: Final = 0.0
@@ -122,8 +123,8 @@ def with_distractor(simulator: Simulator, rate: float) -> Simulator:
     """The simulator with a distractor that is on with probability `rate` in its environment."""
 
     def hide_distractor(
-        behavior: Callable[[VectorEnv[Any, Any, Any], int], Actor],
-        env: VectorEnv[Any, Any, Any],
+        behavior: Callable[[AnyEnv, int], Actor],
+        env: AnyEnv,
         seed: int,
     ) -> WithoutDistractor:
         assert isinstance(env, DistractorEnv)

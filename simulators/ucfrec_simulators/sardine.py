@@ -15,7 +15,6 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 import pyarrow as pa
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
@@ -23,6 +22,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import GymnasiumCatalog
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec.schema import ITEM_ID
+from ucfrec_simulators.session_env import AnyEnv
 
 PACKAGE: Final = "sardine"
 EPSILONS: Final = (0.2, 0.5, 0.8, 1.0)
@@ -85,9 +85,7 @@ class GreedyOracle:
         InputError: `env` is not a `SardineEnvironment`.
     """
 
-    def __init__(
-        self, env: VectorEnv[Any, Any, Any], seed: int, epsilons: Sequence[float] = (0.0,)
-    ) -> None:
+    def __init__(self, env: AnyEnv, seed: int, epsilons: Sequence[float] = (0.0,)) -> None:
         if not isinstance(env.unwrapped, SardineEnvironment):
             raise InputError(f"this behavior policy serves SARDINE, not {type(env).__name__}")
         self._environment, self._choices = env.unwrapped, np.asarray(epsilons)

@@ -16,6 +16,9 @@ from gymnasium.vector.utils import batch_space
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
+AnyEnv = VectorEnv[Any, Any, Any]
+"""A vector environment of any observations and actions."""
+
 
 def data_folder(name: str) -> Path:
     """The folder `name` in `UCFREC_DATA`, by default in `data`."""
@@ -103,19 +106,15 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
             raise ResetNeeded("call reset before the first step")
         rewards, terminated, truncated = self._play(self._check_actions(actions))
         ended = terminated | truncated
-        final = {}
+        final: dict[str, Any] = {}
         if ended.any():
             # Gymnasium's convention is an object array that holds an observation or None.
             final_obs = np.full(self.num_envs, None, dtype=object)
             rows = np.flatnonzero(ended)
             for row, last in zip(rows, self._observe()[rows], strict=True):
                 final_obs[row] = last
-            final = {
-                "final_obs": final_obs,
-                "_final_obs": ended,
-                "final_info": self._info(ended),
-                "_final_info": ended,
-            }
+            final = {"final_obs": final_obs, "final_info": self._info(ended)}
+            final |= {"_final_obs": ended, "_final_info": ended}
             self._begin(rows)
         all_rows = np.ones(self.num_envs, dtype=np.bool_)
         return self._observe(), rewards, terminated, truncated, self._info(all_rows) | final
@@ -132,12 +131,10 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
                 f"{type(self).__name__} takes actions of shape {space.shape}, got {actions.shape}"
             )
         if isinstance(space, spaces.MultiDiscrete):
-            if not np.issubdtype(actions.dtype, np.integer) or not space.contains(
-                actions.astype(space.dtype)
-            ):
-                raise InputError(
-                    f"{type(self).__name__} takes whole numbers from 0 to {space.nvec[0] - 1}"
-                )
+            whole = np.issubdtype(actions.dtype, np.integer)
+            if not whole or not space.contains(actions.astype(space.dtype)):
+                most = space.nvec[0] - 1
+                raise InputError(f"{type(self).__name__} takes whole numbers from 0 to {most}")
             return actions.astype(np.int64)
         if not np.isfinite(actions).all():
             raise InputError(f"{type(self).__name__} got actions that are not finite")

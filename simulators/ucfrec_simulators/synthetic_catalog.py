@@ -1,18 +1,17 @@
 """A synthetic catalogue of tagged items with an exit rule and an exactly known optimal policy."""
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Memoryless, Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.session_env import SessionsEnv, draw_categories
+from ucfrec_simulators.session_env import AnyEnv, SessionsEnv, draw_categories
 
 CLUSTERS: Final = 8
 FACTORS: Final = 4
@@ -111,13 +110,9 @@ class SyntheticCatalog(SessionsEnv):
     def favourites(self, probabilities: Float64Array) -> IntArray:
         """The best items (M, boredom_window) of different tags, the best first, by click
         probabilities (M, n_items)."""
-        by_tag = np.stack(
-            [
-                np.flatnonzero(self.tags == tag)[probabilities[:, self.tags == tag].argmax(1)]
-                for tag in range(self.tags.max() + 1)
-            ],
-            axis=1,
-        )
+        of_tags = (np.flatnonzero(self.tags == tag) for tag in range(self.tags.max() + 1))
+        best = [items[probabilities[:, items].argmax(1)] for items in of_tags]
+        by_tag = np.stack(best, axis=1)
         order = np.argsort(-np.take_along_axis(probabilities, by_tag, 1), axis=1, kind="stable")
         return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
 
@@ -223,20 +218,20 @@ class SoftmaxGuess(Memoryless):
         return chosen, probabilities[np.arange(len(chosen)), chosen].astype(np.float32)
 
 
-def _catalog(env: VectorEnv[Any, Any, Any]) -> SyntheticCatalog:
+def _catalog(env: AnyEnv) -> SyntheticCatalog:
     """The catalogue within `env`, whose policies refuse any other environment."""
     if not isinstance(env.unwrapped, SyntheticCatalog):
         raise InputError(f"this behavior policy serves SyntheticCatalog, not {type(env).__name__}")
     return env.unwrapped
 
 
-def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+def optimal(env: AnyEnv, seed: int) -> Rotation:
     """The optimal policy: `Rotation` with the true probabilities; `seed` is unused."""
     environment = _catalog(env)
     return Rotation(environment, environment.favourites(environment.click_probabilities))
 
 
-def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+def popular(env: AnyEnv, seed: int) -> Rotation:
     """`Rotation` by mean probabilities over users: a non-personalised policy; `seed` is unused."""
     environment = _catalog(env)
     favourites = environment.favourites(environment.click_probabilities.mean(axis=0, keepdims=True))
@@ -251,19 +246,19 @@ QUALITIES: Final = (
 """Error, temperature, epsilon, variety and share of sessions of each policy of the mixture."""
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform items, the others one of the policies of `QUALITIES`.
     """
-    environment = _catalog(env)
-    guesses: list[Actor] = [SoftmaxGuess(environment, seed, *knobs) for *knobs, _ in QUALITIES]
-    return SessionMixture(
-        [Uniform(env, seed), *guesses], [0.2, *(share for *_, share in QUALITIES)], seed
-    )
+    actors, shares = list[Actor]([Uniform(env, seed)]), [0.2]
+    for error, temperature, epsilon, variety, share in QUALITIES:
+        actors.append(SoftmaxGuess(_catalog(env), seed, error, temperature, epsilon, variety))
+        shares.append(share)
+    return SessionMixture(actors, shares, seed)
 
 
-def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
+def softmax(env: AnyEnv, seed: int) -> SoftmaxGuess:
     """A logging policy that tries much: other policies can be evaluated on its logs."""
     knobs = {"error": 0.5, "temperature": 5.0, "epsilon": 0.1, "variety": 0.0}
     return SoftmaxGuess(_catalog(env), seed, **knobs)
@@ -276,11 +271,8 @@ def simulator(mood: float = 0.0) -> Simulator:
         "clicks",
         make=lambda num_envs, folder: SyntheticCatalog(num_envs, mood=mood),
         behaviors={
-            "random": Uniform,
-            "popular": popular,
-            "mixture": mixture,
-            "softmax": softmax,
-            "optimal": optimal,
+            **{"random": Uniform, "popular": popular, "mixture": mixture},
+            **{"softmax": softmax, "optimal": optimal},
         },
         feedback="is_click",
     )

@@ -39,20 +39,13 @@ SHARED = named(
     "embed_ln=embed.norm predict_action.0=head.out transformer.ln_f=final_norm"
 )
 BLOCKS = {
-    "dt": named(
-        "ln_1=attention_norm attn.c_attn=query_key_value attn.c_proj=out ln_2=mlp_norm "
-        "mlp.c_fc=mlp.0 mlp.c_proj=mlp.2"
-    ),
-    "dc": named(
-        "ln_1=mixer_norm conv.rtg_conv1d=mixers.0 conv.obs_conv1d=mixers.1 "
-        "conv.act_conv1d=mixers.2 ln_2=mlp_norm mlp.0=mlp.0 mlp.2=mlp.2"
-    ),
-    "lsdt": named(
-        "attention.fmlp.0=squeeze attention.fl1=gates.0 attention.fl2=gates.1 "
-        "attention.proj_net=out attention.Dynamicconv_layer.linear1=short.gated "
-        "attention.Dynamicconv_layer.linear2=short.out ln1=norm mlp.0=mlp.0 mlp.2=mlp.2 "
-        "ln2=mlp_norm"
-    ),
+    "dt": """ln_1=attention_norm attn.c_attn=query_key_value attn.c_proj=out ln_2=mlp_norm
+        mlp.c_fc=mlp.0 mlp.c_proj=mlp.2""",
+    "dc": """ln_1=mixer_norm conv.rtg_conv1d=mixers.0 conv.obs_conv1d=mixers.1
+        conv.act_conv1d=mixers.2 ln_2=mlp_norm mlp.0=mlp.0 mlp.2=mlp.2""",
+    "lsdt": """attention.fmlp.0=squeeze attention.fl1=gates.0 attention.fl2=gates.1
+        attention.proj_net=out attention.Dynamicconv_layer.linear1=short.gated ln1=norm
+        attention.Dynamicconv_layer.linear2=short.out mlp.0=mlp.0 mlp.2=mlp.2 ln2=mlp_norm""",
 }
 """Names within a block."""
 UNUSED = ("transformer.wte", "predict_return", "predict_rtg", "predict_state")
@@ -60,7 +53,7 @@ UNUSED = ("transformer.wte", "predict_return", "predict_rtg", "predict_state")
 
 def renamed(policy_name: str, weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """The authors' weights by our names."""
-    found, left = {}, dict(weights)
+    found, left, names = {}, dict(weights), named(BLOCKS[policy_name])
     for name in weights:
         layer, _, field = name.rpartition(".")
         if layer.startswith(UNUSED):
@@ -69,11 +62,11 @@ def renamed(policy_name: str, weights: dict[str, Tensor]) -> dict[str, Tensor]:
             found[f"{SHARED[layer]}.{field}"] = left.pop(name)
         else:
             block, inner = layer.removeprefix("transformer.").removeprefix("h.").split(".", 1)
-            if inner in BLOCKS[policy_name]:
+            if inner in names:
                 # The layers of DT's blocks keep their weights transposed.
                 transposed = policy_name == "dt" and weights[name].ndim == 2
                 value = left.pop(name)
-                ours = f"blocks.{block}.{BLOCKS[policy_name][inner]}.{field}"
+                ours = f"blocks.{block}.{names[inner]}.{field}"
                 found[ours] = value.T.contiguous() if transposed else value
     for block in range(LAYERS) if policy_name == "lsdt" else ():
         found |= long_and_short(left, f"transformer.{block}.attention.", f"blocks.{block}.")
@@ -95,15 +88,9 @@ def long_and_short(left: dict[str, Tensor], theirs: str, ours: str) -> dict[str,
 
 
 def windows_of(inputs: dict[str, Tensor]) -> Windows:
-    mask = inputs["mask"].bool()
-    return Windows(
-        states=inputs["states"],
-        actions=inputs["actions"],
-        rewards=torch.zeros(mask.shape),
-        returns_to_go=inputs["returns_to_go"].squeeze(-1),
-        timesteps=inputs["timesteps"],
-        mask=mask,
-    )
+    mask = inputs.pop("mask").bool()
+    inputs["returns_to_go"] = inputs["returns_to_go"].squeeze(-1)
+    return Windows(**inputs, rewards=torch.zeros(mask.shape), mask=mask)
 
 
 @pytest.mark.parametrize("policy_name", POLICIES)
@@ -123,6 +110,5 @@ def test_outputs_equal_those_of_the_authors_code(policy_name: str) -> None:
     assert bool(windows.mask.all()) == (policy_name != "dt")
     with torch.no_grad():
         actions = policy.head.predict(policy.features(windows))
-    torch.testing.assert_close(
-        actions[windows.mask], fixture["actions"][windows.mask], atol=2e-6, rtol=0
-    )
+    ours, expected = actions[windows.mask], fixture["actions"][windows.mask]
+    torch.testing.assert_close(ours, expected, atol=2e-6, rtol=0)

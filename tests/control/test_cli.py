@@ -1,5 +1,6 @@
 """What no command can use is refused on one line before anything is done."""
 
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -7,22 +8,20 @@ import pytest
 from tests.support.control_files import hopper_like, refused, write_hdf5
 
 ZOO_FILE = "hopper_medium-zoo"
-DATA = ("--data", "data")
 
 
-@pytest.mark.parametrize("seed", ["-1", "4294967296", "1.5", "9" * 5000])
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["evaluate", "run", "--seed"],
-        ["distract", "store", "--out", "out", "--seed"],
-        ["screen", "store", "--seed"],
-        ["collect", "--env", "Hopper-v5", "--out", "out", "--seed"],
-        ["benchmark", *DATA, "--evaluation-seed"],
-    ],
-)
-def test_seeds_that_are_none_are_refused(command: list[str], seed: str) -> None:
-    assert "not a whole number from 0 to 4294967295" in refused(*command, seed)
+def test_seeds_that_are_none_are_refused() -> None:
+    for command, seed in product(
+        (
+            "evaluate run --seed",
+            "distract store --out out --seed",
+            "screen store --seed",
+            "collect --env Hopper-v5 --out out --seed",
+            "benchmark --data data --evaluation-seed",
+        ),
+        ("-1", "4294967296", "1.5", "9" * 5000),
+    ):
+        assert "not a whole number from 0 to 4294967295" in refused(*command.split(), seed)
 
 
 @pytest.mark.parametrize(
@@ -69,6 +68,6 @@ def test_what_cannot_be_used_is_refused(
         Path("data").mkdir()
         Path("rows.jsonl").write_text("no row\n")
         write_hdf5(Path("data", f"{ZOO_FILE}.hdf5"), hopper_like((30, 8, 25)))
-        given += [*DATA, "--out", "out"]
+        given += ["--data", "data", "--out", "out"]
         given += ["--file", ZOO_FILE] if "--file" not in given else []
     assert says in refused(*given)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -14,15 +15,9 @@ START = 1_700_000_000_000
 
 
 def make_log(rows: int = 40) -> pd.DataFrame:
-    log = pd.DataFrame({"row": range(rows)})
-    return pd.DataFrame(
-        {
-            "user_id": log["row"] % 7,
-            "item_id": log["row"] % 5,
-            "timestamp": START + log["row"],
-            "reward": log["row"] % 3,
-        }
-    )
+    row = np.arange(rows)
+    columns = {"user_id": row % 7, "item_id": row % 5, "timestamp": START + row, "reward": row % 3}
+    return pd.DataFrame(columns)
 
 
 ITEMS = pd.DataFrame({"item_id": range(5), "price": range(5)})

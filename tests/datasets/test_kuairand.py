@@ -18,10 +18,8 @@ from ucfrec_datasets.kuairand import DATASET
 
 KEYS = ["user_id", "video_id", "time_ms"]
 FEEDBACK = "is_click is_like is_follow is_comment is_forward is_hate long_view"
-NUMBERS = (
-    "is_lowactive_period is_live_streamer is_video_author follow_user_num fans_user_num "
-    "friend_user_num register_days"
-)
+NUMBERS = "is_lowactive_period is_live_streamer is_video_author register_days "
+NUMBERS += "follow_user_num fans_user_num friend_user_num"
 
 
 def real_log() -> tuple[Path, pd.DataFrame]:
@@ -44,14 +42,10 @@ def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
     }
     ids = np.arange(videos)
     basic = {
-        "video_id": ids,
-        "author_id": ids,
-        "video_type": "NORMAL",
-        "upload_dt": "2022-04-10",
+        **{"video_id": ids, "author_id": ids, "video_type": "NORMAL", "upload_dt": "2022-04-10"},
         "upload_type": np.where(ids % 2, "Web", "LongImport"),
-        "video_duration": 1000.0 * ids,
-        **{"visible_status": 0.0, "server_width": 720.0, "server_height": 1280.0},
-        **{"music_id": ids, "music_type": 9.0},
+        **{"video_duration": 1000.0 * ids, "visible_status": 0.0, "server_width": 720.0},
+        **{"server_height": 1280.0, "music_id": ids, "music_type": 9.0},
         "tag": [f"{i % 3},{i % 5}" if i % 7 else None for i in ids],
     }
     people = {"user_id": np.arange(users), "user_active_degree": "full_active"}
@@ -72,14 +66,12 @@ def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
             frame.iloc[piece].to_csv(folder / f"{name}{ending}.csv", index=False)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "parts"),
-    [("pure", {}), ("1k", {}), ("27k", {"log_standard": 2, "video_features_basic": 3})],
-)
-def test_official_files_of_every_release(
-    tmp_path: Path, suffix: str, parts: dict[str, int]
-) -> None:
-    source = tmp_path / "data"
+PARTS = {"pure": {}, "1k": {}, "27k": {"log_standard": 2, "video_features_basic": 3}}
+
+
+@pytest.mark.parametrize("suffix", PARTS)
+def test_official_files_of_every_release(tmp_path: Path, suffix: str) -> None:
+    source, parts = tmp_path / "data", PARTS[suffix]
     source.mkdir()
     official(source, suffix, parts)
     files, mapping = DATASET.resolve([source], LogMapping())
@@ -142,29 +134,24 @@ def test_videos_of_unknown_length_earn_no_watch_ratio(tmp_path: Path) -> None:
     assert report["reward_statistics"]["mean"] == pytest.approx(ratio.mean(), rel=1e-3)
 
 
-def test_a_run_remembers_that_its_log_is_of_kuairand_whatever_the_next_is_called(
-    tmp_path: Path,
-) -> None:
-    folder = tmp_path / "data"
+def test_a_run_knows_its_log_is_of_kuairand_whatever_the_next_is_called(tmp_path: Path) -> None:
+    folder, later = tmp_path / "data", tmp_path / "later"
     folder.mkdir()
+    later.mkdir()
     official(folder, "pure", {})
     store, run, out = (str(tmp_path / name) for name in ("store", "run", "scores.parquet"))
     assert main(["prepare", str(folder), "--dataset", "kuairand", "--out", store]) == 0
     assert main(["train", store, "--policy", "popular", "--out", run]) == 0
-    scores = []
-    for name in ("log_standard_4_08_to_4_21_pure.csv", "may.csv"):
-        log = tmp_path / "later" / name
-        log.parent.mkdir(exist_ok=True)
-        shutil.copy(folder / "log_standard_4_08_to_4_21_pure.csv", log)
-        assert main(["score", run, str(log), "--out", out]) == 0
-        scores.append(pd.read_parquet(out))
-    frame = scores[0]
-    assert len(frame) > 200
-    pd.testing.assert_frame_equal(scores[0], scores[1])
+    name = "log_standard_4_08_to_4_21_pure.csv"
+    for called in (name, "may.csv"):
+        shutil.copy(folder / name, later / called)
     # The same rows under plain names, as an own service would log them.
-    plain = pd.read_csv(log).rename(
-        columns={"video_id": "item_id", "time_ms": "timestamp", "is_click": "reward"}
-    )
-    plain[["user_id", "item_id", "timestamp", "reward"]].to_parquet(tmp_path / "own.parquet")
-    assert main(["score", run, str(tmp_path / "own.parquet"), "--out", out]) == 0
-    pd.testing.assert_frame_equal(pd.read_parquet(out), frame)
+    plain = {"video_id": "item_id", "time_ms": "timestamp", "is_click": "reward"}
+    own = pd.read_csv(folder / name).rename(columns=plain)[["user_id", *plain.values()]]
+    own.to_parquet(later / "own.parquet")
+    scores = []
+    for called in (name, "may.csv", "own.parquet"):
+        assert main(["score", run, str(later / called), "--out", out]) == 0
+        scores.append(pd.read_parquet(out))
+        assert len(scores[-1]) > 200
+        pd.testing.assert_frame_equal(scores[-1], scores[0])

@@ -13,7 +13,7 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec_datasets.kuairec import DATASET
-from ucfrec_simulators.kuai.kuairec import SIMULATOR, SIMULATOR_NX_10, kuairec
+from ucfrec_simulators.kuai.kuairec import SIMULATOR_NX_10, kuairec
 
 USERS, VIDEOS, JUDGED_USERS, JUDGED_VIDEOS = 12, 40, 8, 25
 
@@ -23,18 +23,10 @@ def matrix(pairs: np.ndarray, rng: np.random.Generator) -> pd.DataFrame:
     seconds = np.sort(1_594_000_000 + rng.uniform(0, 9e5, len(pairs))).round(3)
     moments = pd.to_datetime(seconds, unit="s")
     play, duration = rng.integers(0, 30_000, len(pairs)), rng.integers(2_000, 30_000, len(pairs))
-    return pd.DataFrame(
-        {
-            "user_id": pairs[:, 0],
-            "video_id": pairs[:, 1],
-            "play_duration": play,
-            "video_duration": duration,
-            "time": moments.strftime("%Y-%m-%d %H:%M:%S.%f"),
-            "date": moments.strftime("%Y%m%d").astype(int),
-            "timestamp": seconds,
-            "watch_ratio": play / duration,
-        }
-    )
+    columns = {"user_id": pairs[:, 0], "video_id": pairs[:, 1], "play_duration": play}
+    columns |= {"video_duration": duration, "time": moments.strftime("%Y-%m-%d %H:%M:%S.%f")}
+    columns |= {"date": moments.strftime("%Y%m%d").astype(int), "timestamp": seconds}
+    return pd.DataFrame(columns | {"watch_ratio": play / duration})
 
 
 def official(folder: Path) -> Path:
@@ -64,23 +56,16 @@ def official(folder: Path) -> Path:
     users.to_csv(folder / "user_features.csv", index=False)
     social = pd.DataFrame({"user_id": [1], "friend_list": ["[2, 3]"]})
     social.to_csv(folder / "social_network.csv", index=False)
-    video = np.tile(np.arange(VIDEOS), 3)
-    daily = pd.DataFrame({"video_id": video, "date": 20200705 + np.repeat(range(3), VIDEOS)})
-    daily = daily.assign(
-        author_id=video // 3,
-        video_type="NORMAL",
-        upload_dt=[f"2020-03-{1 + n % 28:02d}" for n in video],
-        upload_type=np.where(video % 2, "LongImport", "Web"),
-        visible_status="public",
-        video_duration=np.where(video % 5, 1000.0 * video, np.nan),
-        video_width=720,
-        video_height=np.where(video % 3, 1280, 400),
-        music_id=video,
-        video_tag_id=video % 4,
-        video_tag_name="tag",
-        show_cnt=daily.date - 20200705,
-    )
-    daily.to_csv(folder / "item_daily_features.csv", index=False)
+    video, day = np.tile(np.arange(VIDEOS), 3), np.repeat(range(3), VIDEOS)
+    daily = {
+        **{"video_id": video, "date": 20200705 + day, "author_id": video // 3},
+        **{"video_type": "NORMAL", "upload_dt": [f"2020-03-{1 + n % 28:02d}" for n in video]},
+        **{"upload_type": np.where(video % 2, "LongImport", "Web"), "visible_status": "public"},
+        "video_duration": np.where(video % 5, 1000.0 * video, np.nan),
+        **{"video_width": 720, "video_height": np.where(video % 3, 1280, 400), "music_id": video},
+        **{"video_tag_id": video % 4, "video_tag_name": "tag", "show_cnt": day},
+    }
+    pd.DataFrame(daily).to_csv(folder / "item_daily_features.csv", index=False)
     return folder
 
 
@@ -100,16 +85,12 @@ def test_a_folder_means_the_training_matrix(tmp_path: Path) -> None:
     assert store.item_states.user_features.shape[0] == USERS
 
 
-def test_rows_without_a_time_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_rows_without_a_time_are_counted_and_other_files_refused(tmp_path: Path) -> None:
     folder = official(tmp_path / "data")
     files, mapping = DATASET.resolve([folder / "small_matrix.csv"], LogMapping())
     report = prepare(files, mapping, tmp_path / "store", PrepareOptions(embedding_size=4))
     assert report["rows_read"] == JUDGED_USERS * JUDGED_VIDEOS - 3
     assert report["dropped"]["null_key"] == 20
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    folder = official(tmp_path / "data")
     with pytest.raises(InputError, match="no log among 1 file"):
         DATASET.resolve([folder / "user_features.csv"], LogMapping())
 
@@ -120,35 +101,32 @@ def test_the_environment_is_the_observed_matrix(tmp_path: Path) -> None:
     small = pd.read_csv(folder / "small_matrix.csv")
     assert env.rewards.shape == (JUDGED_USERS, JUDGED_VIDEOS)
     wanted = small.pivot_table(index="user_id", columns="video_id", values="watch_ratio")
-    every = np.indices(env.rewards.shape)
-    np.testing.assert_allclose(
-        env.rewards[every[0], every[1]], wanted.clip(0, 5).fillna(0), rtol=1e-6
-    )
-    assert (env.rewards[every[0], every[1]] == 5).any()
+    users, videos = np.indices(env.rewards.shape)
+    paid = env.rewards[users, videos]
+    np.testing.assert_allclose(paid, wanted.clip(0, 5).fillna(0), rtol=1e-6)
+    assert paid.max() == 5
     np.testing.assert_array_equal(env.item_ids, np.arange(5, 5 + JUDGED_VIDEOS))
     feat = pd.read_csv(folder / "item_categories.csv").set_index("video_id")["feat"]
     assert [str(list(own)) for own in env.tags] == feat.loc[env.item_ids].tolist()
 
 
-def test_it_is_played_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = official(tmp_path / "data")
-    monkeypatch.setattr(Environment, "simulator", lambda self: SIMULATOR)
-    rows = {
-        b: evaluate_behavior(Environment("kuairec", folder), b, 50, 0) for b in ("random", "oracle")
-    }
-    assert rows["oracle"]["R_cum"] > 2 * rows["random"]["R_cum"]
-    assert SIMULATOR_NX_10.make(3, folder).regime.steps == 10
+def test_it_is_played_by_name(tmp_path: Path) -> None:
+    environment = Environment("kuairec", official(tmp_path / "data"))
+    earned = {b: evaluate_behavior(environment, b, 50, 0)["R_cum"] for b in ("random", "oracle")}
+    assert earned["oracle"] > 2 * earned["random"]
+    assert SIMULATOR_NX_10.make(3, environment.folder).regime.steps == 10
 
 
 def test_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
     folder = official(tmp_path / "data")
     categories = pd.read_csv(folder / "item_categories.csv")
     categories.iloc[:10].to_csv(folder / "item_categories.csv", index=False)
-    with pytest.raises(InputError, match=r"item_categories\.csv lacks 20 videos such as 10"):
-        kuairec(1, folder)
-    (folder / "small_matrix.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match=r"small_matrix\.csv is not the official file"):
-        kuairec(1, folder)
-    (folder / "small_matrix.csv").unlink()
-    with pytest.raises(InputError, match=r"small_matrix\.csv is missing; get it from"):
-        kuairec(1, folder)
+    matrix = folder / "small_matrix.csv"
+    for change, says in (
+        (lambda: None, r"item_categories\.csv lacks 20 videos such as 10"),
+        (lambda: matrix.write_text("a,b\n1,2\n"), r"small_matrix\.csv is not the official file"),
+        (matrix.unlink, r"small_matrix\.csv is missing; get it from"),
+    ):
+        change()
+        with pytest.raises(InputError, match=says):
+            kuairec(1, folder)

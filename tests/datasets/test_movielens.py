@@ -20,14 +20,10 @@ from ucfrec_datasets.movielens import DATASET, GENRES
 
 SMALL = {"train.steps": 3, "policy.dim": 8, "rule.choose": False}
 RNG = np.random.default_rng(0)
-RATINGS = pd.DataFrame(
-    {
-        "userId": np.repeat(np.arange(1, 31), 10),
-        "movieId": RNG.integers(1, 41, 300),
-        "rating": RNG.integers(1, 6, 300),
-        "timestamp": 880_000_000 + RNG.permutation(300) * 60,
-    }
-).drop_duplicates(["userId", "movieId"])
+RATINGS = pd.DataFrame({"userId": np.repeat(np.arange(1, 31), 10)})
+RATINGS["movieId"], RATINGS["rating"] = RNG.integers(1, 41, 300), RNG.integers(1, 6, 300)
+RATINGS["timestamp"] = 880_000_000 + RNG.permutation(300) * 60
+RATINGS = RATINGS.drop_duplicates(["userId", "movieId"])
 
 
 def test_a_folder_has_ratings_and_genres(tmp_path: Path) -> None:
@@ -64,9 +60,7 @@ def official_100k() -> bytes:
     return file.getvalue()
 
 
-def test_the_100k_release_is_trained_on_in_one_call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_call_trains_on_the_100k_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = official_100k()
     release = DATASET.releases["movielens-100k"]
     checksum = f"md5:{hashlib.md5(content).hexdigest()}"

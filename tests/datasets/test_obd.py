@@ -1,5 +1,4 @@
-"""Open Bandit Dataset: official file names, and two real policies evaluated on each other's
-logs."""
+"""Open Bandit Dataset: official files, and two real policies evaluated on each other's logs."""
 
 import shutil
 from pathlib import Path
@@ -72,19 +71,16 @@ def test_official_files(tmp_path: Path, name: str) -> None:
     assert (shown_at.sum(1) == 1).all()
 
 
-def test_features_alone_are_refused(tmp_path: Path) -> None:
-    official(tmp_path)
-    with pytest.raises(InputError, match="has features, not impressions"):
-        DATASET.resolve([tmp_path / "item_context.csv"], LogMapping())
-
-
 def test_a_run_of_one_campaign_reads_no_other(tmp_path: Path) -> None:
-    """Both number their items from 0, and mean other items."""
     for campaign in ("men", "women"):
         official(tmp_path / "random" / campaign, campaign)
     men, women = (tmp_path / "random" / name for name in ("men", "women"))
     files, mapping = DATASET.resolve([men], LogMapping())
     prepare(files, mapping, tmp_path / "store")
+    with pytest.raises(InputError, match="has features, not impressions"):
+        DATASET.resolve([men / "item_context.csv"], LogMapping())
+    with pytest.raises(InputError, match=r"men.* share no item; prepare one campaign at a time"):
+        DATASET.resolve([men, women], LogMapping())
     names = pd.read_parquet(tmp_path / "store" / "items.parquet").item_id
     assert list(names) == [f"men/{n}" for n in range(ITEMS)]
     # The item features are found by the same names.
@@ -93,14 +89,6 @@ def test_a_run_of_one_campaign_reads_no_other(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="item is not in the store"):
         prepare(files, mapping, tmp_path / "evaluated", like=tmp_path / "store")
     assert not (tmp_path / "evaluated").exists()
-
-
-def test_two_campaigns_at_once_are_one_clear_error(tmp_path: Path) -> None:
-    for campaign in ("men", "women"):
-        official(tmp_path / "bts" / campaign, campaign)
-    both = [tmp_path / "bts" / "men", tmp_path / "bts" / "women"]
-    with pytest.raises(InputError, match=r"men.* share no item; prepare one campaign at a time"):
-        DATASET.resolve(both, LogMapping())
 
 
 def test_the_campaign_is_in_the_name_of_the_file_or_its_folder(tmp_path: Path) -> None:

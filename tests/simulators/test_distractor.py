@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
 from tests.support.single_session import check_environment
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, rollout
-from ucfrec.arrays import IntArray
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import reward_bit
@@ -46,10 +44,8 @@ def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
     assert main(["collect", *played, "--out", logs]) == 0
     rewards = ["--reward", "clicks", "--session-by", "session_id"]
     assert main(["prepare", f"{logs}/sessions.parquet", *rewards, "--out", taobao]) == 0
-    return {
-        "synthetic-taobao": EpisodeStore.open(taobao),
-        "kuairand": EpisodeStore.open(kuairand_folder / "log" / "store"),
-    }
+    paths = {"synthetic-taobao": taobao, "kuairand": kuairand_folder / "log" / "store"}
+    return {name: EpisodeStore.open(path) for name, path in paths.items()}
 
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
@@ -64,7 +60,7 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     observed = planted.step_values(schema.OBSERVATION, *planted.all_steps())
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
-    assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
+    assert agreed == pytest.approx(agreement, abs=0.03 if flip else 0)
     rate = planted.record.source.others["distractor"]["rate"]
     assert rate == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
@@ -122,17 +118,12 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
         DistractorEnv(plain, 2.0)
 
 
-@pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
-def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
+def test_gymnasium_accepts_it_and_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
     folder = kuairand_folder / "environment"
-    check_environment(Environment(name, folder).simulator().make(1, folder))
-
-
-def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
+    for name in ("synthetic-taobao-distractor", "kuairand-distractor-on"):
+        check_environment(Environment(name, folder).simulator().make(1, folder))
     for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
-        environments = [
-            Environment(n, kuairand_folder / "environment") for n in (name, f"{name}-distractor-on")
-        ]
+        environments = (Environment(n, folder) for n in (name, f"{name}-distractor-on"))
         plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in environments)
         assert plain == distractor
 
@@ -157,37 +148,26 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
         assert row["episodes"] == 20
         env = environment.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
-        steps_played, states_shown = _play_and_watch(env, trained, ids)
-        assert len(states_shown) == steps_played
-        assert (states_shown[:, where] == rate).all()
+        actor, shown = trained.actor(8, DecisionRule(1.0), ids), list[torch.Tensor]()
 
+        def watch(step: Step, actor: Any = actor, shown: list[torch.Tensor] = shown) -> None:
+            shown.append(actor._sessions.states[step.rows, -1, where].clone())
 
-def _play_and_watch(
-    env: VectorEnv[Any, Any, Any], trained: TrainedPolicy, ids: IntArray | None
-) -> tuple[int, torch.Tensor]:
-    """Steps simulated and the states (M, S) that the policy was given in them."""
-    actor = trained.actor(env.num_envs, DecisionRule(1.0), ids)
-    shown: list[torch.Tensor] = []
-
-    def watch(step: Step) -> None:
-        states = actor._sessions.states
-        assert states is not None
-        shown.append(states[step.rows, -1].clone())
-
-    played = rollout(env, actor, 16, 0, on_step=watch)
-    return int(played.lengths.sum()), torch.cat(shown)
+        played = rollout(env, actor, 16, 0, on_step=watch)
+        values = torch.cat(shown)
+        assert len(values) == played.lengths.sum()
+        assert (values == rate).all()
 
 
 def test_screening_finds_the_distractor_among_items_and_its_value_changes_no_return(
     kuairand_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That what is dropped might never have been logged is tested with `ucfrec.runs.screened`."""
     store = EpisodeStore.open(kuairand_folder / "log" / "store")
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     planted = plant_distractor(store, tmp_path / "planted")
     record = train_screened(planted, tmp_path / "run", resolve_config("bc", overrides=TINY), "drop")
     assert record.dropped_observations == (0,)
     trained, folder = TrainedPolicy.load(tmp_path / "run"), kuairand_folder / "environment"
-    environments = (DistractorEnvironment("kuairand", folder, rate) for rate in (0.0, 1.0))
-    off, on = (evaluate_policy(each, trained, "bc", 20, 0, None)["R_cum"] for each in environments)
-    assert off == on
+    off, on = (DistractorEnvironment("kuairand", folder, rate) for rate in (0.0, 1.0))
+    earned, also = (evaluate_policy(env, trained, "bc", 20, 0, None)["R_cum"] for env in (off, on))
+    assert earned == also

@@ -62,6 +62,11 @@ def test_propensities_are_those_of_the_session_s_policy() -> None:
         assert share == pytest.approx(1 - epsilon + other, abs=0.05)
     assert set(before) <= set(EPSILONS)
     assert len(set(before)) > 1
+    shown = []
+    for seed in (2, 2, 3):
+        env = SardineEnvironment("Static", 5)
+        shown.append(play(env, GreedyOracle(env, seed, EPSILONS), 5, seed)[1]["actions"].tolist())
+    assert shown[0] == shown[1] != shown[2]
     # One ε for the whole session; another may be drawn for the next.
     actor.begin(np.array([0]))
     np.testing.assert_array_equal(actor._epsilon[1:], before[1:])
@@ -96,21 +101,11 @@ def test_logs_hold_propensities_and_tags(tmp_path: Path) -> None:
         assert np.flatnonzero(topics).tolist() == tags.tolist()
 
 
-def test_oracles_serve_sardine_only() -> None:
+def test_other_environments_and_missing_packages_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with pytest.raises(InputError, match="serves SARDINE, not SyntheticCatalog"):
         GreedyOracle(SyntheticCatalog(2), 0)
-
-
-def test_users_of_a_seed_are_always_the_same() -> None:
-    def shown(seed: int) -> list[int]:
-        env = SardineEnvironment("Static", 5)
-        actions: list[int] = play(env, GreedyOracle(env, seed, EPSILONS), 5, seed)[1]["actions"]
-        return list(actions)
-
-    assert shown(2) == shown(2) != shown(3)
-
-
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sardine, "PACKAGE", "sardine_that_is_not_installed")
     with pytest.raises(InputError, match=r"pip install 'ucfrec\[sardine\]'"):
         Environment("sardine-static").simulator().make(1, None)

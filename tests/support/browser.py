@@ -24,17 +24,11 @@ class Browser:
             os.dup2(read_by_it, 3)
             os.dup2(written_by_it, 4)
 
-        self._process = subprocess.Popen(
-            [
-                *(CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run"),
-                *("--disable-dev-shm-usage", f"--user-data-dir={folder}"),
-                *("--remote-debugging-pipe", "about:blank"),
-            ],
-            preexec_fn=hand_over,
-            close_fds=False,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        command = (CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run")
+        command += ("--disable-dev-shm-usage", f"--user-data-dir={folder}")
+        command += ("--remote-debugging-pipe", "about:blank")
+        quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, preexec_fn=hand_over, close_fds=False, **quiet)
         os.close(read_by_it)
         os.close(written_by_it)
         self._buffer, self._number, self._session = b"", 0, ""
@@ -70,9 +64,8 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """The value of a JavaScript expression, awaited."""
-        found = self.send(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
+        waiting = {"returnByValue": True, "awaitPromise": True}
+        found = self.send("Runtime.evaluate", expression=script, **waiting)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
@@ -81,22 +74,17 @@ class Browser:
         self.send("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
 
-    def until(self, condition: str, seconds: float = 30) -> None:
+    def until(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + 30
         while not self.run(condition):
             assert time.monotonic() < end, condition
             time.sleep(0.05)
 
     def view(self, width: int, height: int, dark: bool = False) -> None:
         """Set the size and the colour scheme that the visitor prefers."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **screen)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
 

@@ -52,10 +52,9 @@ def planted_vectors(
 def planted_category(
     out: Path, trajectories: int = 150, length: int = 12, moves: float = 0.5, noise: float = 0.0
 ) -> EpisodeStore:
-    """Eight dimensions: 0 drives itself and the reward, 1 to 5 are indicators of a category that
-    holds throughout a trajectory and moves the reward by `moves` from one to the next, 6 is whether
-    the reward is high, 7 is 0. `noise` is the standard deviation of what nothing explains of the
-    reward."""
+    """Eight dimensions: 0 drives itself and the reward, 1 to 5 are of a category that a trajectory
+    keeps and that moves the reward by `moves`, 6 is whether the reward is high, 7 is 0. `noise` is
+    the standard deviation of what nothing explains of the reward."""
     rng = np.random.default_rng(0)
     shape = (trajectories, length)
     states, actions = np.zeros((*shape, 8)), rng.uniform(-1, 1, (*shape, 1))

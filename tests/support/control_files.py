@@ -1,6 +1,5 @@
 """Control datasets made up for tests, and commands on them."""
 
-import json
 import shutil
 from collections.abc import Iterable
 from contextlib import redirect_stderr, redirect_stdout
@@ -10,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from tests.support.records import MISSING, damaged
 from ucfrec.arrays import Array
 from ucfrec.files.atomic import read_json
 from ucfrec_control.cli import main
@@ -80,12 +80,6 @@ def refused(*arguments: object) -> str:
 def changed(run: Path, to: Path, entry: tuple[str, ...], value: object) -> Path:
     """A copy of a run with another value of an entry of its record; None takes it out."""
     shutil.copytree(run, to)
-    record = read_json(run / "run.json")
-    inner = record
-    for name in entry[:-1]:
-        inner = inner[name]
-    inner[entry[-1]] = value
-    if value is None:
-        del inner[entry[-1]]
-    (to / "run.json").write_text(json.dumps(record))
+    damage = MISSING if value is None else value
+    damaged(to / "run.json", read_json(run / "run.json"), entry, damage)
     return to

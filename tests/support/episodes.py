@@ -1,9 +1,5 @@
-"""Random episodes as plain Python lists, the stores they make, and what a slow reader sees there.
-
-Everything here is written from the documentation of `ucfrec.episodes.store` and
-`ucfrec.episodes.states`, one row at a time and in float64, so that tests compare the store with an
-independent computation.
-"""
+"""Random episodes as plain Python lists, the stores they make, and what a slow reader sees there:
+one row at a time, in float64, from the documentation of `ucfrec.episodes.store` and `states`."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -66,14 +62,9 @@ def some_states(
 ) -> ItemStates:
     """Random embeddings, and `users` features a user."""
     generator = torch.Generator().manual_seed(seed)
-    return ItemStates(
-        embeddings=torch.randn(N_ITEMS, DIM, generator=generator),
-        user_features=torch.randn(N_USERS, users, generator=generator),
-        reward_low=low,
-        reward_high=high,
-        window=window,
-        decay=0.7,
-    )
+    embeddings = torch.randn(N_ITEMS, DIM, generator=generator)
+    features = torch.randn(N_USERS, users, generator=generator)
+    return ItemStates(embeddings, features, low, high, window=window, decay=0.7)
 
 
 def step_columns(episodes: list[Logged]) -> dict[str, Array]:
@@ -111,13 +102,8 @@ def write_store(
     path: Path, episodes: list[Logged], states: ItemStates | None = None, shard_steps: int = 2**24
 ) -> EpisodeStore:
     """The store of `episodes`; `states` belongs to episodes with items."""
-    store = EpisodeStore.write(
-        path,
-        step_columns(episodes),
-        lengths_of(episodes),
-        episode_columns(episodes),
-        shard_steps=shard_steps,
-    )
+    columns = step_columns(episodes), lengths_of(episodes), episode_columns(episodes)
+    store = EpisodeStore.write(path, *columns, shard_steps=shard_steps)
     if states is not None:
         states.save(path / ITEM_STATES)
     return store
@@ -156,16 +142,8 @@ def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float
     last_liking = liking(episode.rewards[step - 1]) if vectors else 0.0
     features = states.user_features.double().numpy()
     user = features[episode.user] if episode.user >= 0 else np.zeros(features.shape[1])
-    return np.concatenate(
-        [
-            weighted_mean(recency, vectors),
-            weighted_mean(liked, vectors),
-            last,
-            [last_liking, math.log(1 + step)],
-            user,
-            observation,
-        ]
-    )
+    means = weighted_mean(recency, vectors), weighted_mean(liked, vectors)
+    return np.concatenate([*means, last, [last_liking, math.log(1 + step)], user, observation])
 
 
 def random_edits(

@@ -12,13 +12,10 @@ ITEMS = 4
 
 
 class Echo(gymnasium.Env[Any, Any]):
-    """Five steps; the reward of item a is a, that of a vector its sum.
-
-    A session's secret number is observed as `secret`, and the step as the category `step`; with
-    `whole` the category alone is the observation. `notes` adds an entry of no fixed size. `users`
-    is the `user_id` of every `info`; `visitors` are the users of one session after the other, told
-    by `reset` alone, None for a session without.
-    """
+    """Five steps; the reward of item a is a, that of a vector its sum. Observed are a session's
+    `secret` number and the category `step`, with `whole` the latter alone; `notes` adds an entry of
+    no fixed size. `users` is the `user_id` of every `info`, `visitors` those of one session after
+    the other, told by `reset` alone."""
 
     def __init__(
         self,
@@ -73,13 +70,15 @@ ACTIONS: dict[str, spaces.Space[Any]] = {
     "Slate": spaces.MultiDiscrete([ITEMS, ITEMS]),
     "Matrix": spaces.Box(-1, 1, (2, 2)),
 }
-for _name, _space in ACTIONS.items():
-    gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs={"actions": _space})
-_items = ACTIONS["Discrete"]
-gymnasium.register("ucfrec-test/Whole-v0", Echo, kwargs={"actions": _items, "whole": True})
-gymnasium.register("ucfrec-test/Users-v0", Echo, kwargs={"actions": _items, "users": 77})
-for _name, _visitors in {"Visitors": range(1000, 1009), "Some-visitors": (1000, None)}.items():
-    _arguments = {"actions": _items, "visitors": _visitors}
+_OF_ITEMS: dict[str, dict[str, Any]] = {
+    "Whole": {"whole": True},
+    "Users": {"users": 77},
+    "Visitors": {"visitors": range(1000, 1009)},
+    "Some-visitors": {"visitors": (1000, None)},
+    "Names": {"users": "Ann"},
+    "Notes": {"notes": True},
+}
+_ARGUMENTS = {name: {"actions": space} for name, space in ACTIONS.items()}
+_ARGUMENTS |= {name: {"actions": ACTIONS["Discrete"], **own} for name, own in _OF_ITEMS.items()}
+for _name, _arguments in _ARGUMENTS.items():
     gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs=_arguments)
-gymnasium.register("ucfrec-test/Names-v0", Echo, kwargs={"actions": _items, "users": "Ann"})
-gymnasium.register("ucfrec-test/Notes-v0", Echo, kwargs={"actions": _items, "notes": True})

@@ -2,8 +2,7 @@
 
     python killed_loop.py run|update|promote|join|exposures FOLDER
 
-`FOLDER` has what the work needs, such as what `tests.support.served` makes. Prints how many
-processes were killed. What is left after each kill is checked here, the end by the caller.
+Prints how many were killed. What a kill leaves is checked here, the end by the caller.
 """
 
 import random

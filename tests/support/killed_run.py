@@ -7,13 +7,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
-SETTINGS = (
-    "train.steps=60",
-    "train.validate_every=5",
-    "policy.dim=16",
-    "policy.context=5",
-    "crm.epochs=3",
-)
+SETTINGS = ("train.steps=60", "train.validate_every=5", "policy.dim=16", "policy.context=5")
+SETTINGS += ("crm.epochs=3",)
 
 
 def train(store: Path, run: Path) -> None:

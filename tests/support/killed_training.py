@@ -2,8 +2,7 @@
 
     python killed_training.py SEED FOLDER
 
-Prints how many processes were killed and what the last one's loop returned. One
-interpreter imports torch; each life of the training is a fork of it.
+Prints how many were killed and what the last loop returned. Each is a fork of one interpreter.
 """
 
 import json
@@ -49,14 +48,8 @@ def train(folder: Path) -> Fit:
     def validate() -> float:
         return float(F.mse_loss(net(held_out[0]), held_out[1]))
 
-    config = LoopConfig(
-        steps=STEPS,
-        batch_size=8,
-        learning_rate=0.05,
-        warmup_steps=50,
-        clip_norm=1.0,
-        validate_every=EVERY,
-    )
+    own = {"learning_rate": 0.05, "warmup_steps": 50, "clip_norm": 1.0}
+    config = LoopConfig(steps=STEPS, batch_size=8, validate_every=EVERY, **own)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
         time.sleep(0.001)  # so that no machine is done before it is killed a few times

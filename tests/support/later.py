@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tests.support.tagged import ITEMS, USERS, tagged_log
-from ucfrec.logs.mapping import FeatureTable, LogMapping
+from tests.support.tagged import ITEMS, USERS, tagged_log, tagged_mapping
+from ucfrec.logs.mapping import LogMapping
 
 NEW = 6
 """New items, and as many new users."""
@@ -24,13 +24,4 @@ def later_log(rows: int = 300, seed: int = 1, propensity: bool = False) -> pd.Da
 
 def later_mapping(folder: Path) -> LogMapping:
     """Feature tables of all users and items, in files of their own."""
-    tags = [[f"t{item % 4}", f"u{item % 3}"][: 1 + item % 2] for item in range(ITEMS + NEW)]
-    items = pd.DataFrame({"item_id": range(ITEMS + NEW), "tags": tags})
-    items.to_parquet(folder / "later_items.parquet")
-    ages = np.arange(USERS + NEW) * 1.0
-    users = pd.DataFrame({"user_id": range(100, 100 + len(ages)), "age": ages})
-    users.to_parquet(folder / "later_users.parquet")
-    return LogMapping(
-        item_features=(FeatureTable((folder / "later_items.parquet",), "item_id"),),
-        user_features=(FeatureTable((folder / "later_users.parquet",), "user_id"),),
-    )
+    return tagged_mapping(folder, NEW, "later_")

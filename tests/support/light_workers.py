@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from ucfrec.processes import Interrupted
+from ucfrec.processes import Interrupted, interruptions_raised
 from ucfrec.recommending.server import Parent, Workers, listening_socket
 
 
@@ -41,20 +41,15 @@ def refuse(listening: socket.socket, parent: Parent) -> None:
 
 def refuse_later(listening: socket.socket, parent: Parent) -> None:
     """The first two can start; later ones cannot."""
-    folder = Path(os.environ["LIGHT_WORKERS"])
-    with suppress(FileExistsError):
-        (folder / "first").touch(exist_ok=False)
-        return answer(listening, parent)
-    with suppress(FileExistsError):
-        (folder / "second").touch(exist_ok=False)
-        return answer(listening, parent)
+    for name in ("first", "second"):
+        with suppress(FileExistsError):
+            Path(os.environ["LIGHT_WORKERS"], name).touch(exist_ok=False)
+            return answer(listening, parent)
     parent.failed("no model")
 
 
 def main() -> None:
     """Two workers of the function that is named, until Ctrl-C or TERM."""
-    from ucfrec.processes import interruptions_raised
-
     work = {each.__name__: each for each in (answer, refuse, refuse_later)}[sys.argv[1]]
     with (
         suppress(Interrupted),

@@ -1,8 +1,5 @@
-"""Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL.
-
-The references are those of sb-obp 0.5.10 and scope-rl 0.2.1;
-`tests/off_policy/fixtures/make_obp_fixture.py` made them.
-"""
+"""Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL: of sb-obp
+0.5.10 and scope-rl 0.2.1, made by `tests/off_policy/fixtures/make_obp_fixture.py`."""
 
 from pathlib import Path
 
@@ -20,14 +17,10 @@ def random_steps(
 ) -> LoggedSteps:
     rng = np.random.default_rng(seed)
     n = sum(lengths)
-    return LoggedSteps(
-        session=np.repeat(np.arange(len(lengths)), lengths),
-        reward=rng.normal(size=n),
-        propensity=rng.uniform(0.05, 1, n),
-        target=rng.uniform(0, 1, n) * (rng.random(n) < 0.9),
-        model=Modelled(*rng.normal(size=(3, n)), np.zeros(n)) if modelled else None,
-        discount=discount,
-    )
+    session, reward = np.repeat(np.arange(len(lengths)), lengths), rng.normal(size=n)
+    propensity, target = rng.uniform(0.05, 1, n), rng.uniform(0, 1, n) * (rng.random(n) < 0.9)
+    model = Modelled(*rng.normal(size=(3, n)), np.zeros(n)) if modelled else None
+    return LoggedSteps(session, reward, propensity, target, model=model, discount=discount)
 
 
 def fitted(

@@ -55,10 +55,7 @@ def faulty_log(rows: int, text: bool, seed: int) -> pd.DataFrame:
 def write(frame: pd.DataFrame, path: Path) -> Path:
     """Write a CSV or Parquet file, as its name says."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".csv":
-        frame.to_csv(path, index=False)
-    else:
-        frame.to_parquet(path, index=False)
+    (frame.to_csv if path.suffix == ".csv" else frame.to_parquet)(path, index=False)
     return path
 
 
@@ -84,5 +81,5 @@ def list_users(batches: Iterable[Histories]) -> list[dict[str, Any]]:
             lists["seen"] = batch.seen_ids[seen].tolist()
             if batch.observations is not None:
                 lists["observation"] = batch.observations[number].tolist()
-            users.append({"user_id": user, **lists})
+            users.append({"user_id": user} | lists)
     return users

@@ -31,11 +31,8 @@ class Page:
 
     def code(self, language: str) -> list[str]:
         """Code blocks of a language, without the indentation of the list they stand in."""
-        return [
-            "\n".join(line.removeprefix(indent) for line in code.splitlines())
-            for indent, kind, code in _BLOCK.findall(self.text)
-            if kind == language
-        ]
+        blocks = [(i, code) for i, kind, code in _BLOCK.findall(self.text) if kind == language]
+        return ["\n".join(n.removeprefix(i) for n in code.splitlines()) for i, code in blocks]
 
     def commands(self) -> list[str]:
         """Command lines of `ucfrec` and `ucfrec-control`, continued lines joined."""
@@ -61,14 +58,8 @@ def parse(command: str) -> argparse.Namespace:
 
 def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run code in a process and folder of its own, on one thread."""
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    env, command = {**os.environ, "OMP_NUM_THREADS": "1"}, [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=env)
 
 
 def anchors(text: str) -> set[str]:

@@ -14,9 +14,7 @@ _EPOCH = pd.Timestamp("1970-01-01", tz="UTC")
 def rows_of(files: Sequence[tuple[Path, str]]) -> Rows:
     """The rows that a log has, of rows with one user, item and time that with the highest reward.
 
-    Args:
-        files: Parquet and CSV files, each with the format of its times: "ms", "iso", or of
-            `strptime`.
+    Each file is Parquet or CSV, with the format of its times: "ms", "iso", or of `strptime`.
     """
     frames = [_part(path, written) for path, written in files]
     log = pd.concat(frames, ignore_index=True)
@@ -34,22 +32,17 @@ def _part(path: Path, written: str) -> pd.DataFrame:
     else:
         frame = pd.read_csv(path, dtype=str, keep_default_na=False, na_values=[""])
     frame.columns = [str(name).lower() for name in frame.columns]
-    return pd.DataFrame(
-        {
-            "user": [_text(each) for each in frame["user_id"]],
-            "item": [_text(each) for each in frame["item_id"]],
-            "time": [_time(each, written) for each in frame["timestamp"]],
-            "reward": [_number(each) for each in frame["reward"]],
-        }
-    )
+    columns = {name: map(_text, frame[f"{name}_id"]) for name in ("user", "item")}
+    times = [_time(each, written) for each in frame["timestamp"]]
+    return pd.DataFrame({**columns, "time": times, "reward": map(_number, frame["reward"])})
 
 
 def _text(given: object) -> str | None:
-    return None if given is None or given is pd.NA or given != given else str(given)
+    return None if pd.isna(given) else str(given)
 
 
 def _time(given: object, written: str) -> int | None:
-    if given is None or given is pd.NaT or given != given:
+    if pd.isna(given):
         return None
     if written == "ms":
         return int(str(given))
@@ -62,7 +55,7 @@ def _time(given: object, written: str) -> int | None:
 
 
 def _number(given: object) -> float:
-    if given is None or given is pd.NA or given != given:
+    if pd.isna(given):
         return np.nan
     words = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0}
     return words[str(given)] if str(given) in words else float(str(given))

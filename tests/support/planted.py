@@ -73,11 +73,8 @@ def planted_store() -> EpisodeStore:
     rng = np.random.default_rng(5)
     cuts = np.sort(rng.choice(np.arange(1, STEPS), EPISODES - 1, replace=False))
     t = planted(STEPS, 3).transitions
-    columns = {
-        schema.OBSERVATION: t.states.numpy(),
-        schema.ACTION: t.actions.numpy(),
-        schema.REWARD: t.rewards.numpy(),
-    }
+    columns = {schema.OBSERVATION: t.states.numpy(), schema.ACTION: t.actions.numpy()}
+    columns[schema.REWARD] = t.rewards.numpy()
     split = (np.arange(EPISODES) >= EPISODES - 10).astype(np.uint8)
     folder = Path(tempfile.mkdtemp()) / "store"
     lengths = np.diff(np.concatenate([[0], cuts, [STEPS]]))

@@ -39,12 +39,7 @@ def replayed(
 ) -> Tensor:
     """Probabilities (T + 1, n_items) before each of the T steps of a session, and after them.
 
-    Args:
-        trained: a policy of items, trained without observations.
-        rule: its decision rule.
-        items: indices of the items shown.
-        rewards: of the T steps.
-        user: identifier of the session's user; None for one who is not in the training logs.
+    `items` are indices, of a policy without observations; `user` None is not in the logs.
     """
     told = Told.of(rule, [*items, 0])
     actor = trained.actor(1, told)

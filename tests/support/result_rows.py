@@ -9,24 +9,13 @@ from ucfrec.results.rows import CONFIGURATIONS, ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
-    """A row of a recommendation table with `value` as R_cum; `fields` as they differ from it.
-
-    `metrics` are added to R_cum, other fields replace those of the row.
-    """
-    given: dict[str, Any] = {
-        "suite": "recommendation",
-        "table": "main",
-        "task": "w",
-        "environment": "w",
-        "method": "m",
-        "policy": "m",
-        "training_seed": 0,
-        "checkpoint": "best",
-        "metric": "R_cum",
-    }
-    metric = fields.get("metric", given["metric"])
-    metrics = {metric: value, **fields.pop("metrics", {})}
-    return ResultRow(**given | {"metrics": metrics} | fields)
+    """A row of a recommendation table with `value` as R_cum; `metrics` are added to it, other
+    `fields` replace those of the row."""
+    given: dict[str, Any] = {"suite": "recommendation", "table": "main", "metric": "R_cum"}
+    given |= {"task": "w", "environment": "w", "method": "m", "policy": "m"}
+    given |= {"training_seed": 0, "checkpoint": "best"} | fields
+    given["metrics"] = {given["metric"]: value, **fields.get("metrics", {})}
+    return ResultRow(**given)
 
 
 def read_configurations(folder: Path) -> dict[str, Any]:
@@ -38,15 +27,11 @@ def read_configurations(folder: Path) -> dict[str, Any]:
 def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:
     """Rows of a method without a distractor, with it off and on: a value a seed."""
     metrics = {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0}
+    shared: dict[str, Any] = {"metrics": metrics, "target_return": 3.0}
     return [
-        result_row(
-            value,
-            metrics=metrics,
-            training_seed=seed,
-            target_return=3.0,
-            conditions={"distractor": rate, "quantiles": quantile},
-        )
+        result_row(value, **shared, training_seed=seed, conditions=conditions)
         for quantile in ("0.99", "1")
         for rate, own in values.items()
+        for conditions in [{"distractor": rate, "quantiles": quantile}]
         for seed, value in enumerate(own)
     ]

@@ -6,11 +6,7 @@ from pathlib import Path
 
 
 def wait_until_handled(process: int, number: signal.Signals, seconds: float = 60) -> None:
-    """Return once a process has its own handler of a signal, or has ended.
-
-    Raises:
-        TimeoutError: it has none after `seconds`.
-    """
+    """Return once a process has its own handler of a signal, or has ended."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         try:

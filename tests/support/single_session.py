@@ -28,13 +28,11 @@ class SingleSession(gymnasium.Env[Float32Array, Array]):
 
     def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
         """Take one action; returns observation (O,), reward, terminated, truncated and info."""
-        observations, rewards, terminated, truncated, infos = self._environment.step(
-            np.asarray(action)[None]
-        )
-        ended = bool(terminated[0] | truncated[0])
-        observation = cast(Float32Array, infos["final_obs"][0]) if ended else observations[0]
+        seen, rewards, ends, cuts, infos = self._environment.step(np.asarray(action)[None])
+        ended = bool(ends[0] | cuts[0])
+        observation = cast(Float32Array, infos["final_obs"][0]) if ended else seen[0]
         info = _first(infos["final_info"] if ended else infos)
-        return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        return observation, float(rewards[0]), bool(ends[0]), bool(cuts[0]), info
 
 
 def _first(infos: dict[str, Any]) -> dict[str, Any]:

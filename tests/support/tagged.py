@@ -22,30 +22,19 @@ def tagged_log(rows: int = 900, seed: int = 0) -> pd.DataFrame:
     return log
 
 
-def tagged_mapping(folder: Path) -> LogMapping:
-    """Mapping to feature tables, which are written to `folder`."""
-    tags = [[f"t{item % 4}", f"u{item % 3}"][: 1 + item % 2] for item in range(ITEMS)]
-    pd.DataFrame({"item_id": range(ITEMS), "tags": tags}).to_parquet(folder / "items.parquet")
-    users = pd.DataFrame({"user_id": range(100, 100 + USERS), "age": np.arange(USERS) * 1.0})
-    users.to_parquet(folder / "users.parquet")
-    return LogMapping(
-        item_features=(FeatureTable((folder / "items.parquet",), "item_id"),),
-        user_features=(FeatureTable((folder / "users.parquet",), "user_id"),),
-    )
+def tagged_mapping(folder: Path, more: int = 0, prefix: str = "") -> LogMapping:
+    """Mapping to feature tables, with `more` items and users, which are written to `folder`."""
+    tags = [[f"t{item % 4}", f"u{item % 3}"][: 1 + item % 2] for item in range(ITEMS + more)]
+    ages = np.arange(USERS + more) * 1.0
+    items, users = (folder / f"{prefix}{name}.parquet" for name in ("items", "users"))
+    pd.DataFrame({"item_id": range(len(tags)), "tags": tags}).to_parquet(items)
+    pd.DataFrame({"user_id": range(100, 100 + len(ages)), "age": ages}).to_parquet(users)
+    features = FeatureTable((items,), "item_id"), FeatureTable((users,), "user_id")
+    return LogMapping(item_features=features[:1], user_features=features[1:])
 
 
 def tagged_store(folder: Path, **columns: float) -> EpisodeStore:
-    """The store of `tagged_log`, at `folder / "store"`, beside its log and tables.
-
-    Args:
-        columns: more columns of the log, each of one value.
-    """
-    return store_of(
-        tagged_log().assign(**columns),
-        folder,
-        tagged_mapping(folder),
-        reward="reward",
-        session_by="gap",
-        gap_minutes=120,
-        embedding_size=6,
-    )
+    """The store of `tagged_log`, with more `columns` of one value each, beside log and tables."""
+    log, options = tagged_log().assign(**columns), {"session_by": "gap", "gap_minutes": 120}
+    own = {"reward": "reward", "embedding_size": 6, **options}
+    return store_of(log, folder, tagged_mapping(folder), **own)

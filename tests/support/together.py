@@ -18,10 +18,8 @@ def together(count: int, work: Callable[[], None], folder: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     context = multiprocessing.get_context("fork")
-    children = [
-        context.Process(target=_child, args=(rank, count, port, work, folder))
-        for rank in range(count)
-    ]
+    given = [(rank, count, port, work, folder) for rank in range(count)]
+    children = [context.Process(target=_child, args=arguments) for arguments in given]
     for child in children:
         child.start()
     for child in children:
@@ -34,12 +32,8 @@ def together(count: int, work: Callable[[], None], folder: Path) -> None:
 
 def _child(rank: int, count: int, port: int, work: Callable[[], None], folder: Path) -> None:
     torch.set_num_threads(1)  # a fork has none of its parent's threads
-    os.environ |= {
-        "RANK": str(rank),
-        "WORLD_SIZE": str(count),
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     try:
         with joined():
             work()

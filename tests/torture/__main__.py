@@ -32,20 +32,11 @@ from tests.torture.readers import (
     share_cases,
 )
 
-FULL = {
-    "kills": 500,
-    "interruptions": 200,
-    "pairs": 80,
-    "flips": 1000,
-    "fuzz": 100_000,
-    "limits": 1,
-    "hostile Parquet": 1,
-}
+FULL = {"kills": 500, "interruptions": 200, "pairs": 80, "flips": 1000, "fuzz": 100_000}
+FULL |= {"limits": 1, "hostile Parquet": 1}
 """Number of cases of each check at scale 1."""
-NO_FAULTS = (
-    *("killed", "interrupted", "refused", "found", "harmless", "skipped", "cases"),
-    "ended by a library",
-)
+NO_FAULTS = ("killed", "interrupted", "refused", "found", "harmless", "skipped", "cases")
+NO_FAULTS += ("ended by a library",)
 """Counts of a check that are no faults."""
 Part = tuple[str, str, Callable[[], Counter[str]]]
 """Check, name of the command or reader, and what counts its cases."""
@@ -106,10 +97,9 @@ def list_parts(inputs: Inputs, folder: Path, cases: dict[str, int], seed: int) -
             yield "flips", reader.name, partial(flip_bits, reader, folder, share, seed)
     if "fuzz" in cases:
         readers = list_readers(inputs)
-        for reader, share in zip(
-            readers, share_cases(cases["fuzz"], readers).values(), strict=True
-        ):
-            yield "fuzz", reader.name, partial(fuzz, reader, folder, share, seed)
+        shares = share_cases(cases["fuzz"], readers)
+        for reader in readers:
+            yield "fuzz", reader.name, partial(fuzz, reader, folder, shares[reader.name], seed)
     if "limits" in cases:
         yield "limits", "every command", partial(limits.limits, inputs, folder)
     if "hostile Parquet" in cases:

@@ -30,31 +30,19 @@ class End:
     seconds: float
     hung: bool = False
 
-    @property
-    def lines(self) -> list[str]:
-        """Lines on stderr but notes and those of counting."""
-        quiet = ("benchmark", "ucfrec: note")
-        return [line for line in self.printed.splitlines() if not line.startswith(quiet)]
-
-    @property
-    def traceback(self) -> bool:
-        """Whether a traceback was printed."""
-        return "Traceback (most recent call last)" in self.printed
-
     def fault(self, allowed: Sequence[int]) -> str:
-        """What is wrong with this end; empty if nothing is.
-
-        Args:
-            allowed: exit statuses; 2, 130 and 143 print one line, others no traceback.
-        """
+        """What is wrong with this end; of the `allowed` statuses 2, 130 and 143 print a line."""
+        printed = self.printed.strip()
         if self.hung:
             return "hung"
-        if self.traceback:
-            return "traceback: " + self.printed.strip().splitlines()[-1][:150]
+        if "Traceback (most recent call last)" in printed:
+            return "traceback: " + printed.splitlines()[-1][:150]
         if self.status not in allowed:
-            return f"status {self.status}: {self.printed.strip()[-150:]}"
-        if self.status in (2, 130, 143) and len(self.lines) != 1:
-            return f"{len(self.lines)} lines: {self.printed.strip()[:150]}"
+            return f"status {self.status}: {printed[-150:]}"
+        quiet = ("benchmark", "ucfrec: note")  # notes and lines of counting
+        lines = sum(not line.startswith(quiet) for line in printed.splitlines())
+        if self.status in (2, 130, 143) and lines != 1:
+            return f"{lines} lines: {printed[:150]}"
         return ""
 
 
@@ -116,23 +104,21 @@ def _address_space() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
-def command(*arguments: object, program: str = "ucfrec") -> Callable[[], int]:
+def command(*arguments: object) -> Callable[[], int]:
     """A function that runs one command as its process would."""
 
     def work() -> int:
-        sys.argv = [program, *map(str, arguments)]
-        if program == "ucfrec":
-            from ucfrec.__main__ import main
-        else:
-            from ucfrec_control.__main__ import main
+        sys.argv = ["ucfrec", *map(str, arguments)]
+        from ucfrec.__main__ import main
+
         return main()
 
     return work
 
 
-def run(*arguments: object, program: str = "ucfrec") -> End:
+def run(*arguments: object) -> End:
     """One command from its beginning to its end."""
-    return Running(command(*arguments, program=program)).wait()
+    return Running(command(*arguments)).wait()
 
 
 def run_first(*arguments: object) -> End:
@@ -179,9 +165,5 @@ def leftovers(*folders: Path) -> list[str]:
     """Locks and scratch in the folders."""
     from ucfrec.files.atomic import LOCK, SCRATCH
 
-    return [
-        str(path)
-        for folder in folders
-        for path in folder.rglob(".*")
-        if path.name.endswith((LOCK, SCRATCH))
-    ]
+    hidden = [path for folder in folders for path in folder.rglob(".*")]
+    return [str(path) for path in hidden if path.name.endswith((LOCK, SCRATCH))]

@@ -33,6 +33,12 @@ class Job:
     """Whether the second of two processes waits for the first, instead of being refused."""
 
 
+def require_done(*arguments: object) -> None:
+    end = run_first(*arguments)
+    if end.status:
+        raise SystemExit(f"{arguments[0]}: {end.printed}")
+
+
 class Inputs:
     """Logs, a store, a run and small files of other kinds, made once."""
 
@@ -40,14 +46,9 @@ class Inputs:
         self.folder = folder
         self.logs, self.store, self.run = folder / "logs", folder / "store", folder / "run"
         environment = ("--env", "synthetic-catalog", "--sessions", 60)
-        for arguments in (
-            ("collect", *environment, "--out", self.logs),
-            ("prepare", self.log, "--out", self.store, "--reward", "is_click"),
-            ("train", self.store, "--out", self.run, *SETTINGS),
-        ):
-            end = run_first(*arguments)
-            if end.status:
-                raise SystemExit(f"{arguments[0]}: {end.printed}")
+        require_done("collect", *environment, "--out", self.logs)
+        require_done("prepare", self.log, "--out", self.store, "--reward", "is_click")
+        require_done("train", self.store, "--out", self.run, *SETTINGS)
         self.single_run, self.texts = folder / "single-run", folder / "texts"
         # Readers of a run with a refit read the files of the refit.
         shutil.copytree(self.run, self.single_run, ignore=shutil.ignore_patterns("refit"))
@@ -64,21 +65,13 @@ class Inputs:
         values = {"metric": "r", "metrics": {"r": 1.0}, "interval": [0.5, 1.5]}
         write("rows.jsonl", f"{json.dumps({**row, **values, 'conditions': {'b': 1}})}\n" * 3)
         options = ("--episodes", 20, "--json", self.texts / "evaluations.json")
-        end = run_first("evaluate", self.run, "--env", "synthetic-catalog", *options)
-        if end.status:
-            raise SystemExit(f"evaluate: {end.printed}")
-        write(
-            "mapping.toml",
-            'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'
-            'timestamp = "seconds * 1000"\n[[item_features]]\nfiles = ["items.csv"]\n'
-            'key = "iid"\ncolumns = ["ln(1 + price)"]\n',
-        )
+        require_done("evaluate", self.run, "--env", "synthetic-catalog", *options)
+        mapping = 'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'
+        mapping += 'timestamp = "seconds * 1000"\n[[item_features]]\nfiles = ["items.csv"]\n'
+        write("mapping.toml", f'{mapping}key = "iid"\ncolumns = ["ln(1 + price)"]\n')
         write("empty.toml", "")
-        write(
-            "config.toml",
-            "[train]\nsteps = 20\nlearning_rate = 1e-3\n[policy]\ndim = 16\n"
-            "[csg]\nband = [0.2, 0.5]\n",
-        )
+        train = "[train]\nsteps = 20\nlearning_rate = 1e-3\n"
+        write("config.toml", f"{train}[policy]\ndim = 16\n[csg]\nband = [0.2, 0.5]\n")
         write("setting.txt", "train.steps=200")
         count = np.arange(40)
         frame = pd.DataFrame({"user_id": count % 5, "item_id": (count % 7).astype(str)})
@@ -93,25 +86,21 @@ class Inputs:
 
     def jobs(self) -> list[Job]:
         environment = ("--env", "synthetic-catalog")
+        of_run: dict[str, tuple[str, list[object]]] = {
+            "recommend": (".parquet", [self.log, "--out"]),
+            "score": (".parquet", [self.log, "--out"]),
+            "ope": (".json", [self.log, "--json"]),
+            "evaluate": (".json", [*environment, "--episodes", 20, "--json"]),
+            "report": (".html", ["--out"]),
+        }
         return [
             Job("collect", lambda out: ["collect", *environment, "--sessions", 60, "--out", out]),
             Job("prepare", lambda out: ["prepare", self.log, "--out", out, "--reward", "is_click"]),
             Job("train", lambda out: ["train", self.store, "--out", out, *SETTINGS]),
-            Job(
-                "recommend",
-                lambda out: ["recommend", self.run, self.log, "--out", out],
-                ".parquet",
-                waits=True,
+            *(
+                Job(name, lambda out, n=name, o=own: [n, self.run, *o, out], suffix, waits=True)
+                for name, (suffix, own) in of_run.items()
             ),
-            Job("score", lambda out: ["score", self.run, self.log, "--out", out], ".parquet", True),
-            Job("ope", lambda out: ["ope", self.run, self.log, "--json", out], ".json", True),
-            Job(
-                "evaluate",
-                lambda out: ["evaluate", self.run, *environment, "--episodes", 20, "--json", out],
-                ".json",
-                waits=True,
-            ),
-            Job("report", lambda out: ["report", self.run, "--out", out], ".html", waits=True),
         ]
 
 
@@ -119,12 +108,10 @@ def digest_output(path: Path) -> str:
     """A digest of an output, without times and names of folders."""
     digest = hashlib.sha256()
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    for file in files:
-        if not file.is_file() or file.name in ("run.json", "collect.json") or "events" in str(file):
-            continue
-        name = file.relative_to(path).as_posix() if path.is_dir() else ""
-        digest.update(f"{name}:".encode())
-        digest.update(_content(file))
+    for file in filter(Path.is_file, files):
+        if file.name not in ("run.json", "collect.json") and "events" not in str(file):
+            name = file.relative_to(path).as_posix() if path.is_dir() else ""
+            digest.update(f"{name}:".encode() + _content(file))
     return digest.hexdigest()
 
 
@@ -133,10 +120,8 @@ def _content(file: Path) -> bytes:
         from ucfrec.fitting.checkpoint import load_tensors
 
         tensors, _ = load_tensors(file)
-        return b"".join(
-            name.encode() + np.ascontiguousarray(tensor.numpy()).tobytes()
-            for name, tensor in sorted(tensors.items())
-        )
+        parts = ((k.encode(), v.contiguous().numpy().tobytes()) for k, v in sorted(tensors.items()))
+        return b"".join(name + values for name, values in parts)
     if file.name == "meta.json":
         return json.dumps(json.loads(file.read_text())["fingerprint"]).encode()
     if file.name == "metrics.jsonl":
@@ -159,12 +144,10 @@ def _numbers(value: object) -> object:
     return value if isinstance(value, int | float) else None
 
 
-def use_temporary(folder: Path) -> Path:
+def use_temporary(folder: Path) -> None:
     """Make a folder inside `folder` the one for temporary files."""
     import tempfile
 
-    place = folder / "tmp"
-    place.mkdir()
-    os.environ["TMPDIR"] = str(place)
     tempfile.tempdir = None
-    return place
+    os.environ["TMPDIR"] = str(folder / "tmp")
+    (folder / "tmp").mkdir()

@@ -25,20 +25,15 @@ def limits(inputs: Inputs, folder: Path) -> Counter[str]:
     place.mkdir()
     (place / "file").write_text("")
     for job in inputs.jobs():
-        for name, out in (
-            ("path through a file", place / "file" / "out"),
-            ("name too long", place / ("n" * 254)),
-            ("folder for a file" if job.suffix else "exists", place),
-        ):
+        taken = "folder for a file" if job.suffix else "exists"
+        outs = {"path through a file": place / "file" / "out", taken: place}
+        for name, out in (outs | {"name too long": place / ("n" * 254)}).items():
             _expect(counts, job, name, Running(command(*job.arguments(out))))
         out = place / f"small-{job.name}{job.suffix}"
-        _expect(
-            counts, job, "file too large", Running(_limited(job, out, resource.RLIMIT_FSIZE, 1))
-        )
+        _expect(counts, job, "file too large", Running(_limited(job, out)))
         for megabytes in (60, 200, 1000):
             out = place / f"memory-{job.name}-{megabytes}{job.suffix}"
-            memory = megabytes * 2**20
-            started = Running(command(*job.arguments(out)), memory=memory)
+            started = Running(command(*job.arguments(out)), memory=megabytes * 2**20)
             _expect(counts, job, f"{megabytes} MB of memory", started, (0, 2, *_BY_A_LIBRARY))
         closed = place / "closed"
         closed.mkdir(mode=0o500, exist_ok=True)
@@ -67,17 +62,20 @@ def _expect(
     counts["ended by a library"] += end.status in _BY_A_LIBRARY
 
 
-def _limited(job: Job, out: Path, limit: int, value: int) -> Callable[[], int]:
+def _limited(job: Job, out: Path) -> Callable[[], int]:
+    """The command where no file may have more than one byte."""
+
     def work() -> int:
-        log = os.dup(2)
+        log, limit = os.dup(2), resource.RLIMIT_FSIZE
         # The log of stderr would be too large as well.
         reader, writer = os.pipe()
         os.dup2(writer, 2)
-        resource.setrlimit(limit, (value, resource.getrlimit(limit)[1]))
+        most = resource.getrlimit(limit)[1]
+        resource.setrlimit(limit, (1, most))
         try:
             return command(*job.arguments(out))()
         finally:
-            resource.setrlimit(limit, (resource.getrlimit(limit)[1],) * 2)
+            resource.setrlimit(limit, (most, most))
             os.dup2(log, 2)
             os.close(writer)
             os.write(2, os.read(reader, 60_000))
@@ -103,29 +101,15 @@ def _mounted(job: Job, disk: Path, options: str) -> Callable[[], int]:
 
     def work() -> int:
         disk.mkdir(exist_ok=True)
-        try:
-            os.unshare(os.CLONE_NEWNS)  # type: ignore[attr-defined, unused-ignore]
-        except (AttributeError, OSError):
-            if not _unshare():
-                return 75
-        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        for arguments in (
-            ["mount", "--make-rprivate", "/"],
-            ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(disk)],
-        ):
-            if subprocess.run(arguments, check=False, **quiet).returncode:
+        if ctypes.CDLL(None).unshare(0x00020000):  # CLONE_NEWNS; Python has it from 3.12 on
+            return 75
+        quiet: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+        for arguments in (["--make-rprivate", "/"], ["-t", "tmpfs", "-o", options, "tmpfs", disk]):
+            if subprocess.run(["mount", *arguments], check=False, **quiet).returncode:
                 return 75
         return command(*job.arguments(disk / f"out{job.suffix}"))()
 
     return work
-
-
-def _unshare() -> bool:
-    """`unshare(CLONE_NEWNS)` of the C library, for Python before 3.12."""
-    try:
-        return ctypes.CDLL(None, use_errno=True).unshare(0x00020000) == 0
-    except (OSError, AttributeError):
-        return False
 
 
 def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
@@ -137,11 +121,10 @@ def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
             copy = place / "copy"
             shutil.rmtree(copy, ignore_errors=True)
             copy.mkdir()
-            moved = [
-                str(part).replace(f"{inputs.folder}/{name}", f"{copy}/{name}")
-                for part in job.arguments(place / f"vanished-{job.name}{job.suffix}")
-            ]
-            if moved == [str(p) for p in job.arguments(place / f"vanished-{job.name}{job.suffix}")]:
+            own = [str(part) for part in job.arguments(place / f"vanished-{job.name}{job.suffix}")]
+            source = f"{inputs.folder}/{name}"
+            moved = [part.replace(source, f"{copy}/{name}") for part in own]
+            if moved == own:
                 continue
             shutil.copytree(inputs.folder / name, copy / name)
             started = Running(command(*moved))
@@ -156,10 +139,8 @@ def hostile_parquet(folder: Path) -> Counter[str]:
     place.mkdir()
     Running(lambda: _write_hostile(place)).wait()
     for path in sorted(place.glob("*.parquet")):
-        end = Running(
-            command("prepare", path, "--out", place / "store", "--memory-limit", "200MB"),
-            memory=4 * 2**30,
-        ).wait(60)
+        work = command("prepare", path, "--out", place / "store", "--memory-limit", "200MB")
+        end = Running(work, memory=4 * 2**30).wait(60)
         counts["cases"] += 1
         counts["refused"] += end.status == 2
         if fault := end.fault((0, 2)):
@@ -177,12 +158,8 @@ def _write_hostile(place: Path) -> int:
 
     rows = 200
     count = np.arange(rows)
-    plain = {
-        "user_id": pa.array(count % 7),
-        "item_id": pa.array(count % 5),
-        "timestamp": pa.array(1_700_000_000_000 + count),
-        "reward": pa.array(count % 2),
-    }
+    plain = {"user_id": pa.array(count % 7), "item_id": pa.array(count % 5)}
+    plain |= {"timestamp": pa.array(1_700_000_000_000 + count), "reward": pa.array(count % 2)}
 
     def table(**changes: Any) -> pa.Table:
         return pa.table({**plain, **changes})
@@ -196,9 +173,7 @@ def _write_hostile(place: Path) -> int:
         "no columns": pa.table({}),
         "no rows": table().slice(0, 0),
         "many columns": table(**{f"c{i}": plain["reward"] for i in range(5000)}),
-        "names": table(
-            **{"a\nb": plain["reward"], "\x1b[31m": plain["reward"], "": plain["user_id"]}
-        ),
+        "names": table(**dict.fromkeys(("a\nb", "\x1b[31m", ""), plain["reward"])),
         "nulls": table(user_id=pa.nulls(rows)),
         "long text": table(item_id=pa.array(["x" * 1_000_000 + str(i % 5) for i in count])),
         "wide": table(observation=pa.array([[0.5] * 20_000] * rows)),

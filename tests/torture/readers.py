@@ -12,11 +12,12 @@ import random
 import resource
 import shutil
 import signal
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,12 +90,17 @@ def flip_bits(reader: Reader, folder: Path, cases: int, seed: int) -> Counter[st
     return run_batches(partial(_flip_batch, reader, folder / "flips", seed), folder, cases)
 
 
-def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
+def _copy_folder(reader: Reader, place: Path) -> None:
+    """Get this process ready to read files that the reader may choke on."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     signal.signal(signal.SIGALRM, _raise_hung)
     warnings.simplefilter("ignore")
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(reader.folder, place, copy_function=os.link)
+
+
+def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
+    _copy_folder(reader, place)
     path, content = place / reader.file, (reader.folder / reader.file).read_bytes()
     counts = Counter[str]()
     if (outcome := _read(reader, place, Counter[str]())) != "harmless":
@@ -116,13 +122,13 @@ def _raise_hung(*_: object) -> None:
     raise HungError
 
 
-def _read(reader: Reader, place: Path, counts: Counter[str]) -> str:
+def _read(reader: Reader, place: Path, counts: Counter[str], expected: Any = None) -> str:
     """What came of reading: "found", "harmless" or a fault."""
     from ucfrec.errors import InputError
 
     signal.alarm(SECONDS)
     try:
-        reader.read(place)
+        content = reader.read(place)
     except InputError as error:
         if not str(error).isprintable():
             counts["not one printable line"] += 1
@@ -133,26 +139,20 @@ def _read(reader: Reader, place: Path, counts: Counter[str]) -> str:
         return f"{type(error).__name__} {_find_place(error)}: {str(error)[:80]}"
     finally:
         signal.alarm(0)
-    return "harmless"
+    same = expected is None or _are_equal(content, expected)
+    return "harmless" if same else "silently another content"
 
 
 def _find_place(error: BaseException) -> str:
     """The last place in ucfrec that the error passed."""
-    place, step = "", error.__traceback__
-    while step is not None:
-        file = step.tb_frame.f_code.co_filename
-        if "ucfrec" in file:
-            place = f"{Path(file).name}:{step.tb_lineno}"
-        step = step.tb_next
-    return place
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [f"{Path(f.filename).name}:{f.lineno}" for f in frames if "ucfrec" in f.filename]
+    return ours[-1] if ours else ""
 
 
 def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
-    from ucfrec.errors import InputError
-
     expected, counts = reader.read(reader.folder), Counter[str]()
-    shutil.rmtree(place, ignore_errors=True)
-    shutil.copytree(reader.folder, place)
+    _copy_folder(reader, place)
     files = sorted(path for path in place.rglob("*") if path.is_file() and path.stat().st_size)
     for number in numbers:
         generator = random.Random(f"{seed} {reader.name} {number}")
@@ -161,15 +161,9 @@ def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: 
         flipped = bytearray(content)
         flipped[generator.randrange(len(flipped))] ^= 1 << generator.randrange(8)
         _write_file(path, bytes(flipped))
-        name = path.relative_to(place).as_posix()
-        try:
-            same = _are_equal(reader.read(place), expected)
-        except InputError as error:
-            counts["found" if "\n" not in str(error) else "several lines"] += 1
-        except Exception as error:
-            counts[f"{name}: {type(error).__name__}: {str(error)[:80]}"] += 1
-        else:
-            counts["harmless" if same else f"{name}: silently another content"] += 1
+        outcome = _read(reader, place, counts, expected)
+        fault = f"{path.relative_to(place).as_posix()}: {outcome}"
+        counts[outcome if outcome in ("found", "harmless") else fault] += 1
         _write_file(path, content)
     answer.write_text(json.dumps(counts))
     return 0
@@ -224,7 +218,7 @@ def _mutate_json(generator: random.Random, content: bytes) -> bytes:
     if isinstance(value, dict):
         value.pop("checksum", None)
     for _ in range(generator.choice((1, 1, 1, 2, 5))):
-        place, key, inner = None, None, value
+        place, inner = None, value
         while isinstance(inner, dict | list) and inner:
             place = inner
             key = generator.choice([*inner] if isinstance(inner, dict) else range(len(inner)))
@@ -318,78 +312,41 @@ def list_readers(inputs: Inputs) -> list[Reader]:
     def report(folder: Path) -> object:
         return write_report(folder.with_name("out.html"), [folder])
 
-    def report_results(folder: Path) -> object:
-        return write_report(folder / "out.html", [inputs.run], [folder / "evaluations.json"])
+    def report_results(file: Path) -> object:
+        return write_report(file.with_name("out.html"), [inputs.run], [file])
 
-    def read_setting(folder: Path) -> object:
-        text = (folder / "setting.txt").read_bytes().decode("utf-8", "replace")
-        return resolve_config(overrides=[text])
+    def read_setting(file: Path) -> object:
+        return resolve_config(overrides=[file.read_bytes().decode("utf-8", "replace")])
 
-    def read_log(name: str) -> Callable[[Path], object]:
-        return lambda folder: validate([folder / name], read_mapping(folder / "empty.toml"))
+    def read_log(file: Path) -> object:
+        return validate([file], read_mapping(file.with_name("empty.toml")))
 
+    def lone(folder: Path, file: str, read: Callable[[Path], object], slow: bool = False) -> Reader:
+        """What reads one file, whatever lies beside it."""
+        return Reader(f"{Path(file).name} alone", folder, file, lambda at: read(at / file), slow)
+
+    of_store = ("meta.json", "item_states.safetensors", "users.parquet", "items.parquet")
+    of_store += ("shard-00000/reward.npy", "shard-00000/offsets.npy")
+    of_run = ("run.json", "decision_rule.json", "policy/best.safetensors", "items.parquet")
+    of_run += ("reward_model/item_reward.safetensors", "item_states.safetensors")
+    of_run += ("training_counts.safetensors", "training_returns.safetensors")
     return [
-        *(
-            Reader(file, store, file, read_store)
-            for file in (
-                *("meta.json", "item_states.safetensors", "users.parquet", "items.parquet"),
-                *("shard-00000/reward.npy", "shard-00000/offsets.npy"),
-            )
-        ),
-        *(
-            Reader(f"run: {file}", run, file, act, slow=True)
-            for file in (
-                *("run.json", "decision_rule.json", "policy/best.safetensors", "items.parquet"),
-                *("reward_model/item_reward.safetensors", "item_states.safetensors"),
-                *("training_counts.safetensors", "training_returns.safetensors"),
-            )
-        ),
+        *(Reader(file, store, file, read_store) for file in of_store),
+        *(Reader(f"run: {file}", run, file, act, slow=True) for file in of_run),
         Reader("report: run.json", run, "run.json", report, slow=True),
         Reader("report: samples.json", run, "samples.json", report, slow=True),
-        Reader(
-            "last.safetensors",
-            run,
-            "policy/last.safetensors",
-            lambda folder: load_tensors(folder / "policy/last.safetensors"),
-        ),
-        Reader(
-            "metrics.jsonl",
-            run,
-            "policy/metrics.jsonl",
-            lambda folder: read_metrics(folder / "policy"),
-        ),
-        Reader(
-            "ids",
-            run,
-            "items.parquet",
-            lambda folder: read_ids(folder / "items.parquet", "item_id"),
-        ),
-        Reader("rows.jsonl", texts, "rows.jsonl", lambda folder: read_rows(folder / "rows.jsonl")),
-        Reader(
-            "evaluations.json",
-            texts,
-            "evaluations.json",
-            lambda folder: read_results(folder / "evaluations.json"),
-        ),
-        Reader("report: evaluations.json", texts, "evaluations.json", report_results, slow=True),
-        Reader(
-            "mapping.toml",
-            texts,
-            "mapping.toml",
-            lambda folder: read_mapping(folder / "mapping.toml"),
-        ),
-        Reader(
-            "config.toml",
-            texts,
-            "config.toml",
-            lambda folder: resolve_config(file=folder / "config.toml"),
-        ),
-        Reader("setting", texts, "setting.txt", read_setting),
-        Reader("log.csv", texts, "log.csv", read_log("log.csv"), slow=True),
-        Reader("log.parquet", texts, "log.parquet", read_log("log.parquet"), slow=True),
-        Reader(
-            "hopper.hdf5", texts, "hopper.hdf5", lambda folder: read_d4rl(folder / "hopper.hdf5")
-        ),
+        lone(run, "policy/last.safetensors", load_tensors),
+        lone(run, "policy/metrics.jsonl", lambda file: read_metrics(file.parent)),
+        lone(run, "items.parquet", lambda file: read_ids(file, "item_id")),
+        lone(texts, "rows.jsonl", read_rows),
+        lone(texts, "evaluations.json", read_results),
+        replace(lone(texts, "evaluations.json", report_results, True), name="report: evaluations"),
+        lone(texts, "mapping.toml", read_mapping),
+        lone(texts, "config.toml", lambda file: resolve_config(file=file)),
+        lone(texts, "setting.txt", read_setting),
+        lone(texts, "log.csv", read_log, slow=True),
+        lone(texts, "log.parquet", read_log, slow=True),
+        lone(texts, "hopper.hdf5", read_d4rl),
     ]
 
 

@@ -48,17 +48,10 @@ BUDGETS: Final = {
         seeds_in={ROBUSTNESS: 2},
         evaluation=Evaluation(episodes=20, seed=1000),
         settings=(
-            "train.steps=4000",
-            "train.batch_size=16",
-            "train.warmup_steps=100",
-            "train.validate_every=2000",
-            "train.learning_rate=3e-3",
-            "train.cosine=true",
-            "train.average=0.0",
-            "policy.dim=64",
-            "crm.epochs=3",
-            "crm.learning_rate=4e-3",
-            "csg.epochs=5",
+            *("train.steps=4000", "train.batch_size=16", "train.warmup_steps=100"),
+            *("train.validate_every=2000", "train.learning_rate=3e-3", "train.cosine=true"),
+            *("train.average=0.0", "policy.dim=64"),
+            *("crm.epochs=3", "crm.learning_rate=4e-3", "csg.epochs=5"),
         ),
         of_policies={
             # As many predictions per update as 16 windows of 20 steps; cheap enough for the full
@@ -87,17 +80,10 @@ BUDGETS: Final = {
         seeds_in={ROBUSTNESS: 2},
         evaluation=Evaluation(episodes=50, seed=1000),
         settings=(
-            "train.steps=10000",
-            "train.batch_size=64",
-            "train.warmup_steps=500",
-            "train.validate_every=1000",
-            "train.learning_rate=1e-3",
-            "train.cosine=false",
-            "policy.dim=128",
-            "policy.context=8",
-            "crm.epochs=3",
-            "crm.learning_rate=4e-3",
-            "csg.epochs=5",
+            *("train.steps=10000", "train.batch_size=64", "train.warmup_steps=500"),
+            *("train.validate_every=1000", "train.learning_rate=1e-3", "train.cosine=false"),
+            *("policy.dim=128", "policy.context=8"),
+            *("crm.epochs=3", "crm.learning_rate=4e-3", "csg.epochs=5"),
         ),
         of_policies={
             # As many predictions per update as 64 windows of 8 steps.

@@ -135,13 +135,9 @@ def _rate_of(budget: Budget, method: Method) -> float | None:
     time = _time_settings(method.settings)
     if method.policy == "ucf" and time == _time_settings(METHODS["dt-wo-time"].settings):
         time = ()  # the preset
-    rates = chosen_rates(budget.name)
-    same_policy = [
-        *(
-            name
-            for name, tuned in _TUNED.items()
-            if (tuned.policy, _time_settings(tuned.settings)) == (method.policy, time)
-        ),
-        *(name for name, tuned in SEARCHED.items() if tuned.policy == method.policy),
-    ]
+    rates, same_policy = chosen_rates(budget.name), []
+    for name, tuned in _TUNED.items():
+        if (tuned.policy, _time_settings(tuned.settings)) == (method.policy, time):
+            same_policy.append(name)
+    same_policy += [name for name, tuned in SEARCHED.items() if tuned.policy == method.policy]
     return next((rates[name] for name in same_policy if name in rates), None)

@@ -82,16 +82,11 @@ def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
 
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
     """The verdict of a screening report on each state dimension of `store`."""
-    distractors = {
-        distractor["dimension"] for distractor in store.record.source.others.get("distractors", [])
-    }
-    values = ("dimension", "effect", "p_value", "reward_effect", "reward_p_value")
+    added = {d["dimension"] for d in store.record.source.others.get("distractors", [])}
+    names = ("dimension", "effect", "p_value", "reward_effect", "reward_p_value")
     return [
-        {
-            "distractor": d.dimension in distractors,
-            "flagged": not d.causes,
-            **{name: getattr(d, name) for name in values},
-        }
+        {"distractor": d.dimension in added, "flagged": not d.causes}
+        | {name: getattr(d, name) for name in names}
         for d in dimensions
     ]
 
@@ -111,16 +106,10 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
         added = [d for d in verdicts if d["distractor"]]
         true = [d for d in verdicts if not d["distractor"]]
         effects = [max(d["effect"], d["reward_effect"]) for d in true if d["effect"] is not None]
-        lines.append(
-            {
-                "task": row.task,
-                "distractor": row.conditions["distractor"],
-                "training_seed": row.training_seed,
-                "flagged": all(d["flagged"] for d in added) if added else NONE,
-                "effect": added[0]["effect"] if added else NONE,
-                "reward_effect": added[0]["reward_effect"] if added else NONE,
-                "true_flagged": [d["dimension"] for d in true if d["flagged"]],
-                "weakest_true": min(effects, default=NONE),
-            }
-        )
+        own: dict[str, Any] = {"task": row.task, "distractor": row.conditions["distractor"]}
+        own["training_seed"] = row.training_seed
+        own["flagged"] = all(d["flagged"] for d in added) if added else NONE
+        own |= {name: added[0][name] if added else NONE for name in ("effect", "reward_effect")}
+        own["true_flagged"] = [d["dimension"] for d in true if d["flagged"]]
+        lines.append({**own, "weakest_true": min(effects, default=NONE)})
     return lines

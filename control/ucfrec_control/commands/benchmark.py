@@ -48,11 +48,8 @@ def print_scores(rows: Sequence[ResultRow], table: str) -> None:
     _print_tables(rows, table)
     for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
         rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
-        choice = (
-            f"chosen on validation loss: {rates}"
-            if rates
-            else "not searched: the budget's, over the presets"
-        )
+        default = "not searched: the budget's, over the presets"
+        choice = f"chosen on validation loss: {rates}" if rates else default
         print(f"\nlearning rates of budget {budget}, {choice}")
 
 
@@ -62,10 +59,8 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
         print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
         if lines := score_table(rows, checkpoint):
-            print(
-                f"\nscores of the {checkpoint} checkpoint, mean ± standard error over seeds; bold: "
-                "within 5% of the best"
-            )
+            about = "mean ± standard error over seeds; bold: within 5% of the best"
+            print(f"\nscores of the {checkpoint} checkpoint, {about}")
             print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")

@@ -56,15 +56,9 @@ class Evaluate(Table):
             self._record(self.video)
         rows: list[ResultRow] = []
         for run in self.runs:
-            rows += evaluate_run(
-                run,
-                episodes=self.episodes,
-                seed=self.seed,
-                env_id=self.env,
-                targets=self.target,
-                checkpoints=CHECKPOINTS if self.checkpoint == "both" else (self.checkpoint,),
-                distractor=self.distractor,
-            )
+            checkpoints = CHECKPOINTS if self.checkpoint == "both" else (self.checkpoint,)
+            how: dict[str, Any] = {"episodes": self.episodes, "checkpoints": checkpoints}
+            rows += evaluate_run(run, targets=self.target, **how, **self._options())
         print(format_rows([_shown(row) for row in rows], SHOWN))
         mismatches: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
         for warning in dict.fromkeys(text for texts in mismatches for text in texts):
@@ -72,18 +66,15 @@ class Evaluate(Table):
         if self.json is not None:
             write_results(self.json, rows)
 
+    def _options(self) -> dict[str, Any]:
+        return {"seed": self.seed, "env_id": self.env, "distractor": self.distractor}
+
     def _record(self, video: Path) -> None:
         if len(self.runs) != 1:
             raise InputError(f"--video records one run; {len(self.runs)} were given")
-        episode_return = record_episode(
-            self.runs[0],
-            video,
-            seed=self.seed,
-            checkpoint="best" if self.checkpoint == "best" else "last",
-            env_id=self.env,
-            target=next(iter(self.target), None),
-            distractor=self.distractor,
-        )
+        checkpoint = "best" if self.checkpoint == "best" else "last"
+        how: dict[str, Any] = {"checkpoint": checkpoint, "target": next(iter(self.target), None)}
+        episode_return = record_episode(self.runs[0], video, **how, **self._options())
         print(f"{video}: an episode of return {episode_return:.1f}\n")
 
 

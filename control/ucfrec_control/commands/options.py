@@ -145,14 +145,11 @@ class SuiteOptions(ControlGridOptions):
         """
         budget = budget_of(table or suite, self.budget)
         budget = self.narrow_budget(budget, self.file, self.evaluation_seed)
-        tables = [table] if table else []
-        return self.make_rows(
-            suite,
-            tables,
-            lambda: list_cells(self.require_data(), self.out, budget, self.method),
-            how,
-            describe,
-        )
+
+        def cells() -> Iterable[Cell]:
+            return list_cells(self.require_data(), self.out, budget, self.method)
+
+        return self.make_rows(suite, [table] if table else [], cells, how, describe)
 
 
 def describe_source(trajectories: Trajectories) -> str:

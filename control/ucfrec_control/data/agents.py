@@ -61,20 +61,18 @@ _KINDS: Final = (
 
 
 class Agent(Memoryless):
-    """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`)."""
+    """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`).
 
-    def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
-        """Args:
+    Args:
         network: maps observations (N, O) to (N, A).
         squashed: whether its outputs, within [−1, 1], are stretched to the action space.
-        space: the environment's actions.
         noise: standard deviation of the noise, in halves of the action space's range.
-        seed: of the noise.
-        """
+    """
+
+    def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
         self._network, self._squashed = network.eval(), squashed
         self._low, self._high = (side.astype(np.float64) for side in (space.low, space.high))
-        self._noise, self._seed = noise, seed
-        self._generator = np.random.default_rng(seed)
+        self._noise, self._generator = noise, np.random.default_rng(seed)
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Actions (N, A) within the action space, and None."""
@@ -137,8 +135,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
             raise _refusal(file, f"its clip_mean is {bound!r}, not a number above 0")
         parts.append(nn.Hardtanh(-float(bound), float(bound)))
     squashed = kind.squashed or kwargs.get("squash_output") is True
-    return Agent(nn.Sequential(*parts, *([nn.Tanh()] if squashed else [])), squashed, space, noise,
-                 seed)  # fmt: skip
+    parts += [nn.Tanh()] if squashed else []
+    return Agent(nn.Sequential(*parts), squashed, space, noise, seed)
 
 
 def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:

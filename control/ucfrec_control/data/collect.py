@@ -10,7 +10,6 @@ from typing import Annotated, Any, Final
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.vector import VectorEnv
 from pydantic import Field
 
 from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
@@ -24,7 +23,7 @@ from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacTraining, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
-from ucfrec_control.environments.environments import SIDE_BY_SIDE, make_env
+from ucfrec_control.environments.environments import SIDE_BY_SIDE, AnyEnv, make_env
 
 SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
 _COLUMNS: Final = ("observations", "actions", "rewards")
@@ -86,18 +85,13 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
         medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
         replay = training.sac.replay(training.evaluations[medium]["steps"])
         parts = {
-            "medium": _roll_out(training, medium, env_id, seed, config.size),
+            "medium": training.roll_out(medium, env_id, seed, config.size),
             "medium-replay": _trajectories(replay, replay["terminals"], replay["timeouts"], env_id),
-            "expert": _roll_out(training, expert, env_id, seed, config.size),
+            "expert": training.roll_out(expert, env_id, seed, config.size),
         }
-        parts["medium-expert"] = _join(parts["medium"], parts["expert"])
-        recorded = {
-            "env_id": env_id,
-            "algorithm": "SAC",
-            "seed": seed,
-            "fraction": config.fraction,
-            "random_return": training.random_return,
-        }
+        parts["medium-expert"] = _join([parts["medium"], parts["expert"]])
+        recorded = {"env_id": env_id, "algorithm": "SAC", "seed": seed}
+        recorded |= {"fraction": config.fraction, "random_return": training.random_return}
         for name, index in (("medium", medium), ("expert", expert)):
             for key, value in training.evaluations[index].items():
                 recorded[f"{name}_{key}"] = value
@@ -133,7 +127,7 @@ def collect_agent(
         env.close()
         if len(shape) != 1 or not isinstance(space, Box) or len(space.shape) != 1:
             raise InputError(f"{env_id} has no vector observations and actions")
-        actor = read_agent(agent, shape[0], space, noise, seed_all(seed, 5))
+        actor = read_agent(agent, shape[0], space, noise, seed_all((seed, 5)))
         trajectories = roll_out(actor, env_id, size, (seed, 6), f"roll out {agent.stem}")
         name = f"{_task(env_id)}_{agent.stem}" + (f"-noise{noise:g}" if noise else "")
         recorded = {"env_id": env_id, "agent": agent.name, "noise": noise, "seed": seed}
@@ -194,6 +188,11 @@ class _Training:
     def checkpoint(self) -> Path:
         return self.folder / "checkpoint.pt"
 
+    def roll_out(self, index: int, env_id: str, seed: int, size: int) -> Trajectories:
+        """Roll out a saved policy."""
+        self.sac.load_policy(self.policy(index))
+        return roll_out(self.sac, env_id, size, (seed, 4, index), f"roll out policy {index}")
+
 
 def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Training:
     env = make_env(env_id, 1)
@@ -228,7 +227,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     return training
 
 
-def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
+def _evaluate(training: _Training, env: AnyEnv, seed: int, episodes: int) -> None:
     """Evaluate and save the current policy, and save a checkpoint of the sac."""
     sac, index = training.sac, len(training.evaluations)
     mean_return = _mean_return(env, sac, episodes, (seed, 3, index))
@@ -237,17 +236,14 @@ def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, epi
     sac.save(training.checkpoint, training.evaluations)
 
 
-def _mean_return(
-    env: VectorEnv[Any, Any, Any], actor: Actor, episodes: int, key: tuple[int, ...]
-) -> float:
-    result = rollout(env, actor, episodes, seed_all(*key), describe="evaluate")
-    return float(result.returns.mean())
+def _mean_return(env: AnyEnv, actor: Actor, episodes: int, key: tuple[int, ...]) -> float:
+    return float(rollout(env, actor, episodes, seed_all(key), describe="evaluate").returns.mean())
 
 
 class _Uniform(Memoryless):
     """Actor that chooses uniformly random actions."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+    def __init__(self, env: AnyEnv, seed: int) -> None:
         self._space = env.action_space
         self._space.seed(seed)
 
@@ -285,12 +281,6 @@ def _trajectories(
     )
 
 
-def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
-    """Roll out a saved policy."""
-    training.sac.load_policy(training.policy(index))
-    return roll_out(training.sac, env_id, size, (seed, 4, index), f"roll out policy {index}")
-
-
 def roll_out(
     actor: Actor, env_id: str, size: int, key: tuple[int, ...], describe: str
 ) -> Trajectories:
@@ -304,31 +294,29 @@ def roll_out(
     # A small `size` needs few parallel episodes: the usual step limit of these tasks is 1000.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
+    names = ("episodes", *_COLUMNS, "next_observations", "terminated", "truncated")
     with progress(size, describe, "steps") as bar:
         while sum(len(part.rewards) for part in rounds) < size:
-            seed = seed_all(*key, len(rounds))
+            seed = seed_all((*key, len(rounds)))
             steps: list[Step] = []
             rollout(env, actor, env.num_envs, seed, steps.append, describe="episodes")
-            rounds.append(_sort_by_episode(steps, env_id))
+            columns = _concatenate(steps, names)
+            # The episodes ran in parallel; each becomes contiguous.
+            order = np.argsort(columns["episodes"], kind="stable")
+            sorted_columns = {name: values[order] for name, values in columns.items()}
+            ends = sorted_columns["terminated"], sorted_columns["truncated"]
+            rounds.append(_trajectories(sorted_columns, ends[0], ends[1], env_id))
             bar.update(len(rounds[-1].rewards))
     env.close()
-    return _join(*rounds)
+    return _join(rounds)
 
 
-def _sort_by_episode(steps: list[Step], env_id: str) -> Trajectories:
-    """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
-    order = np.argsort(np.concatenate([step.episodes for step in steps]), kind="stable")
-    names = (*_COLUMNS, "next_observations", "terminated", "truncated")
-    columns = {
-        name: np.concatenate([getattr(step, name) for step in steps])[order] for name in names
-    }
-    return _trajectories(columns, columns["terminated"], columns["truncated"], env_id)
+def _concatenate(parts: Sequence[object], names: Sequence[str]) -> dict[str, Any]:
+    """Arrays of the same attributes of several objects, one after another."""
+    return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
 
 
-def _join(*parts: Trajectories) -> Trajectories:
+def _join(parts: Sequence[Trajectories]) -> Trajectories:
     """Concatenate trajectories; the source is that of the first."""
-    names = (*_COLUMNS, "lengths", "terminated", "final_observations")
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
-    }
+    columns = _concatenate(parts, (*_COLUMNS, "lengths", "terminated", "final_observations"))
     return Trajectories(**columns, source=parts[0].source)

@@ -82,9 +82,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         },
     }
     return Trajectories(
-        observations=steps["observations"][:n][rows],
-        actions=steps["actions"][:n][rows],
-        rewards=steps["rewards"][:n][rows],
+        **{name: steps[name][:n][rows] for name in ("observations", "actions", "rewards")},
         lengths=lengths[keep],
         terminated=terminals[ends][keep],
         final_observations=None if finals is None else finals[keep],
@@ -106,13 +104,8 @@ def write_d4rl(
     timeouts = np.zeros(len(trajectories.rewards), dtype=bool)
     terminals = timeouts.copy()
     terminals[ends], timeouts[ends] = trajectories.terminated, ~trajectories.terminated
-    columns = {
-        "observations": trajectories.observations,
-        "actions": trajectories.actions,
-        "rewards": trajectories.rewards,
-        "terminals": terminals,
-        "timeouts": timeouts,
-    }
+    columns = {name: getattr(trajectories, name) for name in ("observations", "actions", "rewards")}
+    columns |= {"terminals": terminals, "timeouts": timeouts}
     if trajectories.final_observations is not None:
         columns["next_observations"] = np.roll(trajectories.observations, -1, axis=0)
         columns["next_observations"][ends] = trajectories.final_observations

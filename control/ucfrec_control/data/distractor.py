@@ -40,12 +40,9 @@ def add_distractor(
         raise InputError(f"{store.path} is of item logs; distractors are for observed states")
     bit = reward_bit(store, flip, seed, early)
     added = {"dimension": store.observation_size, "flip": flip, "seed": seed, "early": early}
-    return write_observations(
-        store,
-        out,
-        np.column_stack([read_observations(store), bit]),
-        {"distractors": [*store.record.source.others.get("distractors", []), added]},
-    )
+    observations = np.column_stack([read_observations(store), bit])
+    distractors = [*store.record.source.others.get("distractors", []), added]
+    return write_observations(store, out, observations, {"distractors": distractors})
 
 
 def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:

@@ -68,6 +68,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
                 "steps instead of one more"
             )
     spec = dataset.env_spec
+    settings = {} if env_id or spec is None else spec.kwargs
     seen_before = _join([seen[:-1] for seen in observations], source, "observations")
     actions = _join([_vectors(e.actions, source) for e in complete], source, "actions")
     if complete and not is_antmaze(env_id or ""):
@@ -87,9 +88,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
             "dataset": dataset_name(dataset.id),
             "env_id": env_id or (spec.id if spec is not None else None),
             # What configures the environment, such as the maze of AntMaze.
-            "env_settings": {}
-            if env_id or spec is None
-            else {name: value for name, value in spec.kwargs.items() if name != "render_mode"},
+            "env_settings": {name: v for name, v in settings.items() if name != "render_mode"},
             "versions": _made_with(dataset.storage.metadata),
             "dropped": {
                 "unfinished_steps": sum(map(len, episodes)) - sum(map(len, complete)),
@@ -153,17 +152,12 @@ def _buffers(trajectories: Trajectories) -> list[EpisodeBuffer]:
     for number, (end, length) in enumerate(zip(ends, trajectories.lengths, strict=True)):
         rows, earlier = slice(end - length, end), [False] * (length - 1)
         seen, terminated = trajectories.observations[rows], bool(trajectories.terminated[number])
-        buffers.append(
-            EpisodeBuffer(
-                id=number,
-                observations=np.vstack([seen, seen[-1:] if finals is None else finals[number]]),
-                actions=trajectories.actions[rows],
-                rewards=trajectories.rewards[rows].tolist(),
-                terminations=[*earlier, terminated],
-                truncations=[*earlier, not terminated],
-                infos={},
-            )
-        )
+        last = seen[-1:] if finals is None else finals[number]
+        steps: dict[str, Any] = {"actions": trajectories.actions[rows], "infos": {}}
+        steps |= {"rewards": trajectories.rewards[rows].tolist(), "id": number}
+        how = {"terminations": terminated, "truncations": not terminated}
+        steps |= {name: [*earlier, last_step] for name, last_step in how.items()}
+        buffers.append(EpisodeBuffer(observations=np.vstack([seen, last]), **steps))
     return buffers
 
 

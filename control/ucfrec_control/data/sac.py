@@ -12,7 +12,6 @@ from typing import Annotated, Any, Final
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from pydantic import Field
 
 from ucfrec.acting.rollout import Memoryless
@@ -22,6 +21,7 @@ from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 from ucfrec.processes import Progress
 from ucfrec.settings import BatchSize, LearningRate, Share, Width, settings_table
+from ucfrec_control.environments.environments import AnyEnv
 
 _COLUMNS: Final = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 """Names of the replay buffer's arrays, each of shape (capacity, 1, …)."""
@@ -58,9 +58,7 @@ class SacTraining(Memoryless):
         InputError: the action space is not a `Box`, or Stable-Baselines3 is not installed.
     """
 
-    def __init__(
-        self, env: VectorEnv[Any, Any, Any], seed: int, capacity: int, config: SacConfig
-    ) -> None:
+    def __init__(self, env: AnyEnv, seed: int, capacity: int, config: SacConfig) -> None:
         self._env, self._seed, self._config = env, seed, config
         self._model = _sb3_model(env, seed, capacity, config)
         self._buffer = self._model.replay_buffer
@@ -77,7 +75,7 @@ class SacTraining(Memoryless):
 
         Before `learning_starts`, actions are uniformly random and there are no updates.
         """
-        reset_seed = seed_all(self._seed, 1, self.episode)
+        reset_seed = seed_all((self._seed, 1, self.episode))
         generator = np.random.default_rng(reset_seed)
         observations, _ = self._env.reset(seed=reset_seed)
         ended = False
@@ -124,13 +122,11 @@ class SacTraining(Memoryless):
 
     def save(self, path: Path, evaluations: list[dict[str, Any]]) -> None:
         """Write a checkpoint from which training can resume, atomically, and `evaluations`."""
+        columns = {name: getattr(self._buffer, name)[: self.steps] for name in _COLUMNS}
         state = {
             "parameters": self._model.get_parameters(),
             "log_ent_coef": self._model.log_ent_coef.detach(),
-            "replay": {
-                name: torch.from_numpy(getattr(self._buffer, name)[: self.steps])
-                for name in _COLUMNS
-            },
+            "replay": {name: torch.from_numpy(rows) for name, rows in columns.items()},
             "episode": self.episode,
             "evaluations": evaluations,
         }
@@ -154,7 +150,7 @@ class SacTraining(Memoryless):
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
 
 
-def seed_all(*key: int) -> int:
+def seed_all(key: tuple[int, ...]) -> int:
     """Seed the global random generators of numpy and torch, which Stable-Baselines3 uses, by a seed
     derived from `key`; returns it for components with their own generator."""
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])
@@ -166,13 +162,13 @@ def seed_all(*key: int) -> int:
 class _Spaces(gymnasium.Env[Float32Array, Float32Array]):
     """Environment with spaces only, for Stable-Baselines3; the episodes run in another one."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, env: AnyEnv) -> None:
         shape = env.single_observation_space.shape
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, dtype=np.float32)
         self.action_space = env.single_action_space
 
 
-def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, capacity: int, config: SacConfig) -> Any:
+def _sb3_model(env: AnyEnv, seed: int, capacity: int, config: SacConfig) -> Any:
     try:
         from stable_baselines3 import SAC
         from stable_baselines3.common.logger import Logger

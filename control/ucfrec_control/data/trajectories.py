@@ -63,9 +63,7 @@ def control_source(source: Source, where: Path) -> dict[str, Any]:
 
 def count_of(count: int, name: str) -> str:
     """`count` numbers, as the beginning of a sentence."""
-    return (
-        f"{count} number{'' if count == 1 else 's'} of its {name} {'is' if count == 1 else 'are'}"
-    )
+    return f"1 number of its {name} is" if count == 1 else f"{count} numbers of its {name} are"
 
 
 @dataclass(frozen=True)
@@ -132,17 +130,8 @@ class Trajectories:
             InputError: `out` already exists.
         """
         held_out = np.arange(len(self.lengths)) % VALIDATION_EVERY == VALIDATION_EVERY // 2
-        return EpisodeStore.write(
-            out,
-            {
-                schema.OBSERVATION: self.observations,
-                schema.ACTION: self.actions,
-                schema.REWARD: self.rewards,
-            },
-            self.lengths,
-            {
-                schema.SPLIT: held_out * schema.SPLITS.index("validation"),
-                schema.TERMINATED: self.terminated,
-            },
-            source=self.source,
-        )
+        steps = {schema.OBSERVATION: self.observations, schema.ACTION: self.actions}
+        steps[schema.REWARD] = self.rewards
+        split = held_out * schema.SPLITS.index("validation")
+        ends = {schema.SPLIT: split, schema.TERMINATED: self.terminated}
+        return EpisodeStore.write(out, steps, self.lengths, ends, source=self.source)

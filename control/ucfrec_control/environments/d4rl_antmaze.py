@@ -39,10 +39,7 @@ class D4RLAntMaze(AntMazeEnv):
     """
 
     def __init__(self, maze: str, render_mode: str | None = None) -> None:
-        """
-        Args:
-            maze: `umaze`, `medium` or `large`.
-        """
+        """`maze` is `umaze`, `medium` or `large`."""
         walls, self._goal_cell = _MAZES[maze]
         with scratch_folder(Path(gettempdir()), "maze") as folder:
             super().__init__(

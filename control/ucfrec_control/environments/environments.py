@@ -5,7 +5,7 @@ AntMaze (extra `antmaze`) has observations in the layout of D4RL's datasets.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from io import StringIO
@@ -27,6 +27,7 @@ _MOST_FRAMES = 1000
 """Largest number of simulated frames a step, which data of others states; MuJoCo's environments:
 5."""
 
+AnyEnv = VectorEnv[Any, Any, Any]
 Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
 _STEPS = {"umaze": 700, "medium": 1000, "large": 1000}
 _REBUILT = {D4RL_ANTMAZE.format(maze=maze): (maze, limit) for maze, limit in _STEPS.items()}
@@ -46,7 +47,7 @@ def make_env(
     appended: Sequence[float] = (),
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
-) -> VectorEnv[Any, Any, Any]:
+) -> AnyEnv:
     """Make `count` copies of an environment that reset in the step that ends an episode.
 
     They share one process because measurements showed that a MuJoCo step costs less than
@@ -208,12 +209,9 @@ def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
         )
     for package in ("gymnasium", "mujoco", "gymnasium-robotics"):
         made_with = dataset["versions"].get(package)
-        try:
-            installed = version(package)
-        except PackageNotFoundError:
-            continue
-        if made_with not in (None, installed):
-            warnings_.append(
-                f"the data was made with {package} {made_with}, {installed} is installed"
-            )
+        with suppress(PackageNotFoundError):
+            if made_with not in (None, here := version(package)):
+                warnings_.append(
+                    f"the data was made with {package} {made_with}, {here} is installed"
+                )
     return warnings_

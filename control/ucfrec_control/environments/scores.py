@@ -64,30 +64,25 @@ TASKS = (
 )
 
 
-def find_task(*names: str | None) -> Task | None:
-    """The task of the first of some names of environments, files or datasets that belongs to one;
-    None if no name does."""
-    for name in names:
-        for task in TASKS:
-            if task.pattern in _plain(name or ""):
-                return task
-    return None
+def find_task(name: str | None, other: str | None = None) -> Task | None:
+    """The task of a name of an environment, file or dataset, else of another name; None if neither
+    belongs to one."""
+    plain = [_plain(each or "") for each in (name, other)]
+    return next((task for each in plain for task in TASKS if task.pattern in each), None)
 
 
-def require_task(*names: str | None) -> Task:
+def require_task(name: str | None, other: str | None = None) -> Task:
     """As `find_task`.
 
     Raises:
         InputError: no name matches a task.
     """
-    task = find_task(*names)
-    if task is None:
-        supported = ", ".join(task.name for task in TASKS)
-        raise InputError(
-            f"no reference returns are known for {' or '.join(filter(None, names)) or 'it'}; "
-            f"scores are for {supported}"
-        )
-    return task
+    if task := find_task(name, other):
+        return task
+    raise InputError(
+        f"no reference returns are known for {' or '.join(filter(None, (name, other))) or 'it'}; "
+        f"scores are for {', '.join(task.name for task in TASKS)}"
+    )
 
 
 # The first match counts. "medium" comes after the longer names that contain it, and after

@@ -73,10 +73,8 @@ def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     mean, std = training_views(store)[0].state_statistics
     # Constant dimensions are never edited.
     varies = std > 0
-    scaled = [
-        ((states - mean) / std)[:, varies].double().numpy()
-        for states in (factual, torch.from_numpy(copies.edit_state[rows]))
-    ]
+    edited = torch.from_numpy(copies.edit_state[rows])
+    scaled = [((s - mean) / std)[:, varies].double().numpy() for s in (factual, edited)]
     return scaled[0], scaled[1]
 
 
@@ -109,8 +107,7 @@ class Editing:
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
         rng = np.random.default_rng(seed)
         rows = torch.from_numpy(rng.permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS])
-        fields = fitted.__dataclass_fields__
-        factual = Transitions(*(getattr(fitted, name)[rows] for name in fields))
+        factual = Transitions(**{name: values[rows] for name, values in vars(fitted).items()})
         if config.csg.kind == "faithful":
             faithful = CounterfactualStateGenerator(crm, config.csg)
             weights = run / "csg" / "best.safetensors"

@@ -172,10 +172,11 @@ def _draw_run(run: _Run, kind: str) -> Figure:
     if kind == "attention":
         return plots.attention_map(diagnostics.attention(run.path), run.title)
     if kind == "states":
-        return plots.state_overlay(*diagnostics.edit_states(run.path), run.title)
+        factual, edited = diagnostics.edit_states(run.path)
+        return plots.state_overlay(factual, edited, run.title)
+    edges, counts, band = diagnostics.move_histogram(run.path)
     if kind == "moves":
-        return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
-    band = diagnostics.move_histogram(run.path)[2]
+        return plots.move_histogram(edges, counts, band, run.title)
     shares = diagnostics.acceptance_grid(run.path, LOWS, HIGHS)
     return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)
 
@@ -220,27 +221,23 @@ def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
 def _plan_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     groups = grouped(rows, lambda row: (row.conditions["budget"], row.task))
     for (budget, task), task_rows in groups.items():
-        name, bars = f"{budget}-{task}", plots.robustness_bars
         lines = [row.as_line() for row in task_rows]
-        score = partial(bars, lines, "score", "normalised score", task)
-        yield _Plan("robustness-scores", name, score)
-        if lost := drops(task_rows):
-            drop = partial(bars, lost, "drop", "loss (% of the clean score)", task)
-            yield _Plan("robustness-drops", name, drop)
-        if rises := loss_rises(task_rows):
-            rise = partial(bars, rises, "rise", "rise of the action loss (%)", task)
-            yield _Plan("robustness-losses", name, rise)
+        for kind, bars, value, label in (
+            ("scores", lines, "score", "normalised score"),
+            ("drops", drops(task_rows), "drop", "loss (% of the clean score)"),
+            ("losses", loss_rises(task_rows), "rise", "rise of the action loss (%)"),
+        ):
+            if bars:
+                draw = partial(plots.robustness_bars, bars, value, label, task)
+                yield _Plan(f"robustness-{kind}", f"{budget}-{task}", draw)
 
 
 def _plan_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of the methods that were given more than one target return."""
-    methods = grouped(rows, lambda row: (row.task, row.method))
-    several = {
-        method
-        for method, method_rows in methods.items()
-        if len({row.target_return for row in method_rows}) > 1
-    }
-    rows_with_targets = [row for row in rows if (row.task, row.method) in several]
+    methods = grouped(rows, lambda row: (row.task, row.method)).values()
+    several = [own for own in methods if len({row.target_return for row in own}) > 1]
+    shown = {id(row) for own in several for row in own}
+    rows_with_targets = [row for row in rows if id(row) in shown]
     for task, task_rows in grouped(rows_with_targets, lambda row: row.task).items():
         lines = [row.as_line() for row in task_rows]
         yield _Plan("returns", task, partial(plots.return_curves, lines, task))

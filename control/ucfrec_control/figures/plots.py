@@ -25,31 +25,15 @@ _PALETTE = (
 )
 # A method or condition has the same color in all figures.
 _FIXED = {
-    "bc": "#8C8C8C",
-    "dt": "#0072B2",
-    "dc": "#56B4E9",
-    "lsdt": "#009E73",
-    "ucf": "#D55E00",
-    "ucf-screened": "#CC79A7",
-    "ucf-dropped": "#F0E442",
-    "ucf-wo-count": "#E69F00",
-    "ucf-wo-arch": "#000000",
-    "none": "#8C8C8C",
-    "deterministic": "#0072B2",
-    "stochastic": "#56B4E9",
-    "early": "#E69F00",
+    **{"bc": "#8C8C8C", "dt": "#0072B2", "dc": "#56B4E9", "lsdt": "#009E73", "ucf": "#D55E00"},
+    **{"ucf-screened": "#CC79A7", "ucf-dropped": "#F0E442"},
+    **{"ucf-wo-count": "#E69F00", "ucf-wo-arch": "#000000"},
+    **{"none": "#8C8C8C", "deterministic": "#0072B2", "stochastic": "#56B4E9", "early": "#E69F00"},
 }
 _LABELS = {
-    "bc": "BC",
-    "dt": "DT",
-    "dc": "DC",
-    "lsdt": "LSDT",
-    "ucf": "UCF",
-    "ucf-screened": "UCF, screened",
-    "ucf-dropped": "UCF, dropped",
-    "ucf-wo-count": "w/o Count",
-    "ucf-wo-arch": "w/o Arch",
-    "none": "no distractor",
+    **{name: name.upper() for name in ("bc", "dt", "dc", "lsdt", "ucf")},
+    **{"ucf-screened": "UCF, screened", "ucf-dropped": "UCF, dropped"},
+    **{"ucf-wo-count": "w/o Count", "ucf-wo-arch": "w/o Arch", "none": "no distractor"},
 }
 _PANELS = 3
 """Most datasets side by side."""
@@ -79,10 +63,8 @@ def move_histogram(
     axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=FACTUAL, edgecolor="white")
     for bound, name in zip(band, (r"$\rho_\mathrm{low}$", r"$\rho_\mathrm{high}$"), strict=True):
         axes.axvline(bound, color="black", linestyle="--", linewidth=0.9)
-        axes.annotate(
-            name, (bound, 1), (2, -2), xycoords=("data", "axes fraction"), va="top",
-            textcoords="offset points",
-        )  # fmt: skip
+        place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "va": "top"}
+        axes.annotate(name, (bound, 1), (2, -2), textcoords="offset points", **place)
     axes.set_xlim(0, 1.12 * max(edges[-1], band[1]))
     axes.set_ylim(0, 1.18 * max(shares.max(), 1e-9))
     return figure
@@ -101,22 +83,19 @@ def acceptance_heatmap(
     Args:
         acceptance: (lows, highs) from 0 to 1, NaN where there is no such band.
     """
-    names = [rf"$\rho_\mathrm{{{side}}}$ (standard deviations)" for side in ("high", "low")]
-    figure, axes = _figure(COLUMN, 2.6, title, *names)
+    high, low = (rf"$\rho_\mathrm{{{side}}}$ (standard deviations)" for side in ("high", "low"))
+    figure, axes = _figure(COLUMN, 2.6, title, high, low)
     image = axes.imshow(100 * acceptance, vmin=0, vmax=100, origin="lower", aspect="auto")
     axes.spines[["left", "bottom"]].set_visible(False)
     dark = colormaps[image.get_cmap().name]
     for (row, column), share in np.ndenumerate(acceptance):
         if np.isfinite(share):
-            bright = np.mean(dark(share)[:3]) > 0.5
-            axes.text(
-                column, row, f"{100 * share:.0f}", ha="center", va="center",
-                color="black" if bright else "white",
-            )  # fmt: skip
+            color = "black" if np.mean(dark(share)[:3]) > 0.5 else "white"
+            text = f"{100 * share:.0f}"
+            axes.text(column, row, text, ha="center", va="center", color=color)
         if (lows[row], highs[column]) == tuple(band):
-            axes.add_patch(
-                Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=EDITED, lw=2)
-            )
+            corner = (column - 0.5, row - 0.5)
+            axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=EDITED, lw=2))
     axes.set_xticks(range(len(highs)), [f"{value:g}" for value in highs])
     axes.set_yticks(range(len(lows)), [f"{value:g}" for value in lows])
     axes.tick_params(length=0)
@@ -135,16 +114,14 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
     centre = factual.mean(axis=0)
     _, spread, directions = np.linalg.svd(factual - centre, full_matrices=False)
     variance = 100 * spread**2 / (spread**2).sum()
-    for states, name, color, marker in (
-        (factual, "logged", FACTUAL, "o"),
-        (edited, "edited", EDITED, "x"),
+    for states, name, color, marker, width in (
+        (factual, "logged", FACTUAL, "o", 0.0),
+        (edited, "edited", EDITED, "x", 0.5),
     ):
         # Drawn as pixels in the SVG too: thousands of points make it slow to open.
         x, y = ((states - centre) @ directions[:2].T).T
-        width = 0.5 if marker == "x" else 0
-        axes.scatter(
-            x, y, s=7, c=color, marker=marker, lw=width, alpha=0.45, label=name, rasterized=True
-        )
+        look: dict[str, Any] = {"s": 7, "c": color, "marker": marker, "lw": width}
+        axes.scatter(x, y, alpha=0.45, label=name, rasterized=True, **look)
     legend = axes.legend(loc="best", markerscale=2, handletextpad=0.2)
     for handle in legend.legend_handles:
         if handle is not None:
@@ -195,9 +172,8 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
         returns = [reached[method, target] for target in at]
         means = [summary(values).mean for values in returns]
         axes.plot(at, means, "o-", color=color, label=label(method))
-        axes.fill_between(
-            at, list(map(min, returns)), list(map(max, returns)), color=color, alpha=0.2, lw=0
-        )
+        low, high = (list(map(end, returns)) for end in (min, max))
+        axes.fill_between(at, low, high, color=color, alpha=0.2, lw=0)
     targets, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
     axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
     axes.set_xlim(0, 1.03 * max(targets))
@@ -281,12 +257,12 @@ def training_curves(
     """
     figure, axes = _figure(COLUMN, 2.5, title, "training step", ylabel)
     for method, color in colors(curves).items():
-        steps = sorted(set.intersection(*(set(seed) for seed in curves[method])))
-        values = np.array([[seed[step] for step in steps] for seed in curves[method]])
+        first, *others = seeds = curves[method]
+        steps = sorted(step for step in first if all(step in seed for seed in others))
+        values = np.array([[seed[step] for step in steps] for seed in seeds])
         axes.plot(steps, values.mean(axis=0), color=color, label=label(method))
-        axes.fill_between(
-            steps, values.min(axis=0), values.max(axis=0), color=color, alpha=0.2, linewidth=0
-        )
+        low, high = values.min(axis=0), values.max(axis=0)
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
     axes.set_xlim(left=0)
     axes.grid(True)
     _legend_below(figure, axes, 4)
@@ -329,10 +305,9 @@ def _figure(
 
 
 def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    figure.legend(
-        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns,
-        handlelength=1.4, columnspacing=1.2,
-    )  # fmt: skip
+    handles, labels = axes.get_legend_handles_labels()
+    spacing = {"ncols": columns, "handlelength": 1.4, "columnspacing": 1.2}
+    figure.legend(handles, labels, loc="outside lower center", **spacing)
 
 
 def _group_seeds(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
@@ -24,6 +23,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
     SIDE_BY_SIDE,
+    AnyEnv,
     Wrap,
     environment_of_data,
     make_env,
@@ -81,11 +81,9 @@ def evaluate_run(
             rows += [replace(row, checkpoint=checkpoint) for row in rows]
             continue
         environment = environment_of(trained, env_id)
-        played = [
-            _row(trained, environment, rule, episodes, seed, distractor)
-            for rule in rules_of(trained, environment, targets)
-        ]
-        rows += [replace(row, checkpoint=checkpoint) for row in played]
+        for rule in rules_of(trained, environment, targets):
+            row = _row(trained, environment, rule, episodes, seed, distractor)
+            rows.append(replace(row, checkpoint=checkpoint))
     return rows
 
 
@@ -116,11 +114,7 @@ def _dataset(trained: Trained) -> dict[str, Any]:
 
 
 def environment_of(trained: Trained, env_id: str | None) -> str:
-    """`env_id`, or the environment of the data if it is None.
-
-    Raises:
-        InputError: the environment of the data cannot be used; see `environment_of_data`.
-    """
+    """`env_id`, or `environment_of_data` if it is None, with its errors."""
     return env_id or environment_of_data(_dataset(trained))
 
 
@@ -131,7 +125,7 @@ def open_environment(
     wrappers: Sequence[Wrap] = (),
     distractor: float = 0.0,
     **settings: Any,
-) -> VectorEnv[Any, Any, Any]:
+) -> AnyEnv:
     """`count` environments that show what was logged where the policy was trained, distractors
     fixed to `distractor`; `settings` are arguments over those of the data.
 
@@ -200,6 +194,8 @@ def _row(
         env.close()
     seconds = time.perf_counter() - began
     low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
+    conditions: dict[str, Any] = {"episodes": episodes, "distractor_fixed_to": distractor}
+    conditions["lambda_mask"] = record.settings["policy"].get("lambda_mask")
     row = ResultRow(
         suite=EVALUATE,
         table=EVALUATE,
@@ -208,11 +204,7 @@ def _row(
         policy=record.config.policy_name,
         training_seed=record.seed,
         evaluation_seed=seed,
-        conditions={
-            "episodes": episodes,
-            "distractor_fixed_to": distractor,
-            "lambda_mask": record.settings["policy"].get("lambda_mask"),
-        },
+        conditions=conditions,
         config_hash=config_hash(record.settings),
         data_fingerprint=record.fingerprint,
         metric="score",
@@ -261,8 +253,8 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
     dimensions = [d - sum(lower < d for lower in dropped) for d in distractors if d not in dropped]
     losses = []
     for _ in range(_BATCHES):
-        steps = validation.draw_steps(generator, _BATCH)
-        windows = validation.windows(*steps, trained.policy.config.context)
+        episodes, steps = validation.draw_steps(generator, _BATCH)
+        windows = validation.windows(episodes, steps, trained.policy.config.context)
         fixed = windows.states.clone()
         fixed[..., dimensions] = 0.0
         both = (windows, replace(windows, states=fixed))

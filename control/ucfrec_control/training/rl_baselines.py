@@ -215,19 +215,15 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     record, checkpoint = RLRecord.read(out), out / _CHECKPOINT
     step, seconds = _resume(checkpoint, algorithm, dataset)
     log = MetricsLog(out, step)
+    quiet = {"logger_adapter": d3rlpy.logging.NoopAdapterFactory(), "show_progress": False}
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
             if step:  # a new seed after each checkpoint, so no generator's state is saved
                 d3rlpy.seed(seed + step)
             steps = min(CHECKPOINT_EVERY, config.steps - step)
-            ((_, losses),) = algorithm.fit(
-                dataset,
-                n_steps=steps,
-                n_steps_per_epoch=steps,
-                logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-                show_progress=False,
-                callback=lambda *_: bar.update(),
-            )
+            size = {"n_steps": steps, "n_steps_per_epoch": steps}
+            how = {"callback": lambda *_: bar.update(), **quiet}
+            ((_, losses),) = algorithm.fit(dataset, **size, **how)
             step += steps
             log.add(step, losses)
             state: dict[str, Any] = {"step": step, "seconds": seconds + perf_counter() - started}
@@ -247,16 +243,14 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
+    (action_size,) = store.record.columns[schema.ACTION]
     entries = {
         "files": {},
         "library": "d3rlpy",
         "command": command_line(),
         "config": plain_config(config, seed),
         "seed": seed,
-        "sizes": {
-            **{"state": store.state_size, "items": 0},
-            "action": store.record.columns[schema.ACTION][0],
-        },
+        "sizes": {"state": store.state_size, "items": 0, "action": action_size},
         "fingerprint": store.record.fingerprint,
         "data": store.record.source,
         "versions": versions((*PACKAGES, "d3rlpy")),
@@ -338,9 +332,7 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
         max_weight=100.0,
         reward_scaler=scaler,
         actor_optim_factory=d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=cosine),
-        actor_encoder_factory=layers,
-        critic_encoder_factory=layers,
-        value_encoder_factory=layers,
+        **{f"{part}_encoder_factory": layers for part in ("actor", "critic", "value")},
         actor_learning_rate=config.learning_rate,
         critic_learning_rate=config.learning_rate,
         **settings,

@@ -153,9 +153,8 @@ class _Data:
         self.moving = self.changes.abs().amax(0) > 0
         held_out = held_out_steps(view, self.episodes)
         self.seen, self.held_out = np.flatnonzero(~held_out), np.flatnonzero(held_out)
-        self.reward_variance = max(
-            float(self.rewards[torch.from_numpy(self.held_out)].var()), 1e-12
-        )
+        variance = self.rewards[torch.from_numpy(self.held_out)].var()
+        self.reward_variance = max(float(variance), 1e-12)
         self.config, self.seed = config, seed
 
     def absences(self, missing: Sequence[Collection[int]]) -> Tensor:
@@ -186,26 +185,17 @@ class _Perceptrons(nn.Module):
 class _Predictors(nn.Module):
     """M predictors of the next state, the reward given, and of the reward, dimensions missing."""
 
-    def __init__(self, size: int, action_size: int, width: int, count: int = 1) -> None:
+    def __init__(self, data: _Data, count: int = 1) -> None:
         super().__init__()
-        self.sizes, inputs = (size, action_size, width), 2 * size + action_size
-        self.next_state = _Perceptrons((inputs + 1, width, width, size), count)
+        width, inputs = data.config.hidden, 2 * data.size + data.actions.shape[1]
+        self.next_state = _Perceptrons((inputs + 1, width, width, data.size), count)
         self.reward = _Perceptrons((inputs, width, width, 1), count)
-
-    def repeat(self, count: int) -> "_Predictors":
-        """`count` copies of a single pair."""
-        copies = _Predictors(*self.sizes, count)
-        with torch.no_grad():
-            for copy, original in zip(copies.parameters(), self.parameters(), strict=True):
-                copy.copy_(original.expand_as(copy))
-        return copies
 
     def errors(self, data: _Data, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
         """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
         missing = missing.expand(-1, len(rows), -1)
-        actions, rewards = (
-            values[rows].expand(len(missing), -1, -1) for values in (data.actions, data.rewards)
-        )
+        actions = data.actions[rows].expand(len(missing), -1, -1)
+        rewards = data.rewards[rows].expand(len(missing), -1, -1)
         inputs = torch.cat([data.states[rows] * (1 - missing), missing, actions], 2)
         next_errors = self.next_state(torch.cat([inputs, rewards], 2)) - data.changes[rows]
         return next_errors.square(), (self.reward(inputs) - rewards).square().squeeze(2)
@@ -242,7 +232,7 @@ class _Predictors(nn.Module):
 def _fit_shared(data: _Data) -> _Predictors:
     """A pair of predictors that serves every missing dimension."""
     config, size = data.config, data.size
-    predictors = _Predictors(size, data.actions.shape[1], config.hidden)
+    predictors = _Predictors(data)
     absences = data.absences([*((dimension,) for dimension in range(size)), ()])[:, 0]
 
     def draw() -> Tensor:
@@ -256,10 +246,9 @@ def _fit_shared(data: _Data) -> _Predictors:
 
 def _find_helpful(shared: _Predictors, data: _Data) -> list[int]:
     """Dimensions without which the shared predictor knows less of the reward."""
-    missing = [(), *((dimension,) for dimension in range(data.size))]
     whole, *errors = (
-        float(shared.all_errors(data, data.held_out, data.absences([one]))[1].mean())
-        for one in missing
+        float(shared.all_errors(data, data.held_out, data.absences([missing]))[1].mean())
+        for missing in [(), *((dimension,) for dimension in range(data.size))]
     )
     most = whole + data.config.min_reward_effect * data.reward_variance
     return [dimension for dimension, error in enumerate(errors) if error >= most]
@@ -311,10 +300,14 @@ class _Errors(NamedTuple):
 def _fit_own(shared: _Predictors, data: _Data, missing: Sequence[Collection[int]]) -> _Errors:
     """Fit a copy of the shared pair for each of `missing` further, and measure its errors."""
     config, absences = data.config, data.absences(missing)
-    pair = shared.repeat(len(missing))
+    pair = _Predictors(data, len(missing))
+    with torch.no_grad():
+        for copy, original in zip(pair.parameters(), shared.parameters(), strict=True):
+            copy.copy_(original.expand_as(copy))
     rate, about = config.learning_rate / 3, f"{len(missing)} cases"
     pair.fit(data, lambda: absences, config.own_steps, rate, about)
     rng, count = np.random.default_rng(data.seed), min(len(data.seen), 4 * _CHUNK)
     sample = np.sort(rng.choice(data.seen, count, replace=False))
     fitted = pair.all_errors(data, sample, absences)[0].mean(1)
-    return _Errors(data, absences, fitted, *pair.all_errors(data, data.held_out, absences))
+    next_state, reward = pair.all_errors(data, data.held_out, absences)
+    return _Errors(data, absences, fitted, next_state, reward)

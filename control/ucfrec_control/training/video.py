@@ -61,10 +61,8 @@ def record_episode(
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:
         with _rendering(environment):
-            recorder = partial(_Recorder, take=take)
-            env = open_environment(
-                trained, environment, 1, [recorder], distractor=distractor, render_mode="rgb_array"
-            )
+            how: dict[str, Any] = {"distractor": distractor, "render_mode": "rgb_array"}
+            env = open_environment(trained, environment, 1, [partial(_Recorder, take=take)], **how)
         try:
             rolled_out = rollout(env, trained.actor(1, rule), 1, seed, describe="record episode")
         finally:
@@ -136,10 +134,9 @@ def _video(out: Path) -> Iterator[Take]:
 
         def take(frame: Frame, fps: float) -> None:
             if not writers:
-                size = (frame.shape[1], frame.shape[0])
-                writer = imageio_ffmpeg.write_frames(
-                    str(scratch), size, fps=fps, output_params=["-f", "mp4"]
-                )
+                size, form = (frame.shape[1], frame.shape[0]), ["-f", "mp4"]
+                path = str(scratch)
+                writer = imageio_ffmpeg.write_frames(path, size, fps=fps, output_params=form)
                 writer.send(None)
                 writers.append(stack.enter_context(closing(writer)))
             writers[0].send(np.ascontiguousarray(frame))

@@ -24,6 +24,10 @@ BASELINES: Final[Mapping[str, Method]] = {
 """The methods of Table 2 beside UCF."""
 
 
+def _simple(name: str, settings: tuple[str, ...] = (), vectors: bool = True) -> Method:
+    return Method(name, ("rule.choose=false", *settings), conditioned=False, vectors=vectors)
+
+
 def _extend(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
     return replace(method, settings=(*method.settings, *settings), vectors=vectors)
 
@@ -42,21 +46,16 @@ PAPER: Final[Mapping[str, Method]] = {
 }
 """UCF as the paper has it, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Final[Mapping[str, Method]] = {
-    "popular": Method("popular", ("rule.choose=false",), conditioned=False),
-    "item-rate": Method("item-rate", ("rule.choose=false",), conditioned=False, vectors=False),
-    "item-rate-mask": Method(
-        "item-rate",
-        ("rule.choose=false", "rule.default_tag_window=10"),
-        conditioned=False,
-        vectors=False,
-        tags=True,
+    "popular": _simple("popular"),
+    "item-rate": _simple("item-rate", vectors=False),
+    "item-rate-mask": replace(
+        _simple("item-rate", ("rule.default_tag_window=10",), vectors=False), tags=True
     ),
-    "item-knn": Method("item-knn", ("rule.choose=false",), conditioned=False, vectors=False),
     **{
-        name: Method(name, ("rule.choose=false",), conditioned=False, vectors=False)
-        for name in ("recent-clicks", "recent-rate", "boosted")
+        name: _simple(name, vectors=False)
+        for name in ("item-knn", "recent-clicks", "recent-rate", "boosted")
     },
-    "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
+    "crm-greedy": _simple("crm-greedy"),
     **{name: _extend(method, PLAIN, True) for name, method in BASELINES.items()},
     **{f"{name}+shared": _extend(method, SHARED, False) for name, method in BASELINES.items()},
     **{name: _extend(method, PLAIN, False) for name, method in PEERS.items()},
@@ -109,23 +108,12 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         seeds=3,
         logs=2,
         tasks=MAIN,
-        tasks_of={
-            "shared": SHARED_TASKS,
-            "sweeps": ("synthetic-catalog",),
-            "distractor": ("synthetic-catalog",),
-        },
+        tasks_of={"shared": SHARED_TASKS, "sweeps": SWEPT[:1], "distractor": SWEPT[:1]},
         sessions=6000,
         settings=(
-            "policy.dim=64",
-            "train.steps=400",
-            "train.learning_rate=1e-3",
-            "train.warmup_steps=40",
-            "train.validate_every=100",
-            "train.average=0.0",
-            "crm.epochs=8",
-            "crm.learning_rate=4e-3",
-            "rule.sessions=50",
-            "rule.evidence=0",
+            *("policy.dim=64", "train.steps=400", "train.learning_rate=1e-3"),
+            *("train.warmup_steps=40", "train.validate_every=100", "train.average=0.0"),
+            *("crm.epochs=8", "crm.learning_rate=4e-3", "rule.sessions=50", "rule.evidence=0"),
         ),
         of_policies={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=400",)},
         evaluation=Evaluation(episodes=300, seed=1_000_000),

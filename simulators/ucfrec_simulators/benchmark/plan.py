@@ -92,7 +92,8 @@ class RecommendationCells:
     def _sweeps(self, task: Task) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
         store = EpisodeStore.open(task.store)
-        spread = float(store.step_values(schema.REWARD, *store.all_steps()).std())
+        episodes, steps = store.all_steps()
+        spread = float(store.step_values(schema.REWARD, episodes, steps).std())
         sweeps = {
             **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
             **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
@@ -112,21 +113,17 @@ class RecommendationCells:
         planted = task.store.with_name("distractor-store")
         if not planted.exists():
             plant_distractor(EpisodeStore.open(task.store), planted)
-        environments = tuple(
-            DistractorEnvironment(environment.name, environment.folder, rate) for rate in (OFF, ON)
-        )
-        both = (
-            replace(task, environments=(environment,)),
-            replace(
-                task, name=f"{task.name}, distractor", store=planted, environments=environments
-            ),
-        )
+        name, folder = environment.name, environment.folder
+        clean = replace(task, environments=(environment,))
+        shown = tuple(DistractorEnvironment(name, folder, rate) for rate in (OFF, ON))
+        title = f"{task.name}, distractor"
+        both = (clean, replace(task, name=title, store=planted, environments=shown))
         # Cells that share a run lie far apart, so that no process waits for another's.
         for quantile, variant in product(DISTRACTOR_TARGETS, both):
             evaluation = replace(self._budget.evaluation, target_quantile=quantile)
-            conditions = {"quantiles": f"{quantile:g}"}
+            methods, conditions = DISTRACTOR_METHODS, {"quantiles": f"{quantile:g}"}
             yield from self._plan.list_trained(
-                "distractor", variant, DISTRACTOR_METHODS, evaluation, conditions
+                "distractor", variant, methods, evaluation, conditions
             )
 
     def _list_trained(

@@ -56,28 +56,22 @@ class Log:
     """Number of parts of a given log; 1 for all of it."""
 
 
-def built_in(name: str, behaviors: Sequence[str], folder: Path, log: Log) -> Task:
-    """An environment of this package that needs no logs, with logs of its mixture of behaviors, and
-    those that are evaluated as references."""
-    environment = Environment(name)
-    store = collect_store(environment, folder, log.sessions, log.seed)
-    return Task(environment.title, store, (environment,), tuple(behaviors))
-
-
 def sardine(name: str, folder: Path, log: Log) -> Task:
     """An environment of SARDINE, with logs of its mixture of oracles; a twelfth of the sessions are
     collected, because they have 100 steps."""
     return simulated(Environment(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 
-def simulated(environment: Environment, folder: Path, log: Log) -> Task:
+def simulated(
+    environment: Environment, folder: Path, log: Log, behaviors: Sequence[str] = ()
+) -> Task:
     """Any environment that needs no files, with logs of its mixture or, without one, of random
-    actions.
+    actions, and the built-in policies that are evaluated as references (all if empty).
 
     Raises:
         InputError: the environment cannot be made.
     """
-    behaviors = tuple(environment.simulator().behaviors)
+    behaviors = tuple(behaviors or environment.simulator().behaviors)
     store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), behaviors)
 
@@ -111,14 +105,11 @@ def kuairand(folder: Path, log: Log) -> Task:
     if not filled.exists():
         played = folder / "environment-store"
         if not played.exists():
-            rows = window(logs, "time_ms", later)
-            _prepare(
-                "kuairand", rows, folder / "log_standard_environment.parquet", features, played
-            )
+            rows, log_file = window(logs, "time_ms", later), "log_standard_environment.parquet"
+            _prepare("kuairand", rows, folder / log_file, features, played)
         complete(EpisodeStore.open(played), tags, filled)
-    return Task(
-        "kuairand", store, tuple(Environment(name, filled) for name in KUAIRAND), REFERENCES
-    )
+    environments = tuple(Environment(name, filled) for name in KUAIRAND)
+    return Task("kuairand", store, environments, REFERENCES)
 
 
 def kuairec(folder: Path, log: Log) -> Task:
@@ -153,7 +144,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
 TASKS: Final[Mapping[str, Callable[[Path, Log], Task]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
-    **{name: partial(built_in, name, behaviors) for name, behaviors in _REFERENCES.items()},
+    **{n: partial(simulated, Environment(n), behaviors=b) for n, b in _REFERENCES.items()},
     "sardine-static": partial(sardine, "sardine-static"),
     "sardine-boredinf": partial(sardine, "sardine-boredinf"),
 }

@@ -5,13 +5,13 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
+from ucfrec_simulators.session_env import AnyEnv
 
 MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
 """Whose tags `random-mask` excludes: those of the last ten items, in every environment."""
@@ -20,7 +20,7 @@ MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
 class _Insider(Memoryless):
     """A policy that reads the environment itself, not what `info` says of it."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+    def __init__(self, env: AnyEnv, seed: int) -> None:
         if not isinstance(env.unwrapped, KuaiEnv):
             raise InputError(f"this behavior policy serves KuaiEnv, not {type(env).__name__}")
         self._environment, self._generator = env.unwrapped, np.random.default_rng([seed, 1])
@@ -66,7 +66,7 @@ class Oracle(_Insider):
         return rewards.argmax(axis=1), None
 
 
-BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
+BEHAVIORS: Final[Mapping[str, Callable[[AnyEnv, int], Actor]]] = {
     "random": Uniform,
     "random-mask": RandomMask,
     "oracle": Oracle,

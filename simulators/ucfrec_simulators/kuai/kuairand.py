@@ -46,10 +46,11 @@ def kuairand(
         if not (folder / name).is_file():
             raise InputError(f"{folder / name} is missing; {MAKE_IT}")
     users, items = pq.read_table(folder / USERS_FILE), pq.read_table(folder / ITEMS_FILE)
-    vectors = [table["vector"].combine_chunks() for table in (users, items)]
-    completed = Completed(*(np.asarray(v.flatten()).reshape(len(v), -1) for v in vectors))
-    ids = np.asarray(users[schema.USER_ID]), np.asarray(items[schema.ITEM_ID])
-    return KuaiEnv(num_envs, completed, items["tags"].to_pylist(), exit_rule, regime, *ids)
+    columns = [table["vector"].combine_chunks() for table in (users, items)]
+    of_users, of_items = (np.asarray(v.flatten()).reshape(len(v), -1) for v in columns)
+    table, tags = Completed(of_users, of_items), items["tags"].to_pylist()
+    user_ids, item_ids = np.asarray(users[schema.USER_ID]), np.asarray(items[schema.ITEM_ID])
+    return KuaiEnv(num_envs, table, tags, exit_rule, regime, user_ids, item_ids)
 
 
 def read_tags(path: Path) -> dict[int, tuple[int, ...]]:

@@ -41,12 +41,8 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
 
 
 def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: ExitRule) -> pa.Table:
-    """Add a `session_id` to the rows: a session ends where the user would have left.
-
-    Args:
-        rows: as returned by `window`.
-        tags: tags of each video; videos without tags may be missing.
-    """
+    """Add a `session_id` to rows of `window`: a session ends where the user would have left; videos
+    without tags may be missing in `tags`."""
     videos, numbers = np.unique(np.asarray(rows[VIDEO]), return_inverse=True)
     video_tags: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
     sessions = sessions_by_exit(np.asarray(rows[USER]), numbers, video_tags, exit_rule)
@@ -54,13 +50,8 @@ def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: Ex
 
 
 def part_of(rows: pa.Table, part: int, parts: int) -> pa.Table:
-    """The sessions of one of `parts` parts of a log, to which they are dealt out at random.
-
-    Args:
-        rows: with a `session_id`, numbered from 0.
-        part: which part, from 0.
-        parts: number of parts; 1 for all rows.
-    """
+    """The sessions, numbered from 0, of one of `parts` parts of a log (from 0), to which they are
+    dealt out at random."""
     sessions = np.asarray(rows[SESSION_ID])
     dealt = np.random.default_rng(0).integers(parts, size=sessions.max() + 1)
     return rows.filter(pa.array(dealt[sessions] == part))

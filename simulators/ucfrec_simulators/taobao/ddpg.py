@@ -16,7 +16,6 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.acting.rollout import Actor, Memoryless, Step, Uniform, rollout
@@ -26,6 +25,7 @@ from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import SessionMixture, truncated_normal
+from ucfrec_simulators.session_env import AnyEnv
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
     MAX_CLICKS,
@@ -90,9 +90,7 @@ class Training:
         InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """
 
-    def __init__(
-        self, env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
-    ) -> None:
+    def __init__(self, env: AnyEnv, seed: int, config: DdpgConfig = DEFAULT) -> None:
         taobao(env)
         self._high = _high(env)
         self._config = config
@@ -171,12 +169,12 @@ class _Taken:
 class _Spaces(gymnasium.Env[Float32Array, Array]):
     """The spaces that Stable-Baselines3 needs; the sessions themselves are run by `rollout`."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, env: AnyEnv) -> None:
         self.observation_space = gymnasium.spaces.Box(-1, 1, env.single_observation_space.shape)
         self.action_space = env.single_action_space
 
 
-def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> Any:
+def _sb3_model(env: AnyEnv, seed: int, config: DdpgConfig) -> Any:
     """A `stable_baselines3.DDPG`."""
     try:
         from stable_baselines3 import DDPG
@@ -213,7 +211,7 @@ def _forward(network: nn.Module, scaled: Float32Array) -> Float32Array:
     return actions
 
 
-def _high(env: VectorEnv[Any, Any, Any]) -> Float32Array:
+def _high(env: AnyEnv) -> Float32Array:
     """(O,) upper bounds of the observations, which scale them to [−1, 1]."""
     space = env.single_observation_space
     assert isinstance(space, gymnasium.spaces.Box)
@@ -221,7 +219,7 @@ def _high(env: VectorEnv[Any, Any, Any]) -> Float32Array:
 
 
 @random_state_kept()
-def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> list[nn.Module]:
+def snapshots(env: AnyEnv, seed: int, config: DdpgConfig) -> list[nn.Module]:
     """Policy networks of one training after equal shares of its sessions, earliest first.
 
     They are trained at the first use and cached as safetensors in `$UCFREC_CACHE`
@@ -246,9 +244,7 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
     return networks
 
 
-def _train(
-    env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig
-) -> list[dict[str, torch.Tensor]]:
+def _train(env: AnyEnv, seed: int, config: DdpgConfig) -> list[dict[str, torch.Tensor]]:
     ongoing = Training(env, seed, config)
     taken: list[dict[str, torch.Tensor]] = []
     ended = 0
@@ -279,27 +275,25 @@ def _fingerprint(environment: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
-def snapshot_mixture(
-    env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
-) -> SessionMixture:
+def snapshot_mixture(env: AnyEnv, seed: int, config: DdpgConfig = DEFAULT) -> SessionMixture:
     """Each session is served by one snapshot, drawn uniformly when the session starts."""
     high, networks = _high(env), snapshots(env, seed, config)
     actors = [Noisy(n, high, config.noise, [seed, 54, i]) for i, n in enumerate(networks)]
     return SessionMixture(actors, [1.0] * len(actors), seed)
 
 
-def expert(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Noisy:
+def expert(env: AnyEnv, seed: int, config: DdpgConfig = DEFAULT) -> Noisy:
     """The last snapshot, with the same noise as in training."""
     return Noisy(snapshots(env, seed, config)[-1], _high(env), config.noise, [seed, 55])
 
 
-BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
+BEHAVIORS: Final[Mapping[str, Callable[[AnyEnv, int], Actor]]] = {
     "ddpg-training": Training,
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,
 }
 """Behavior policies by DDPG."""
-COMMON: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
+COMMON: Final[Mapping[str, Callable[[AnyEnv, int], Actor]]] = {
     "random": Uniform,
     "zero": zero_actor,
     "best-constant": best_constant_actor,

@@ -3,17 +3,16 @@ interface."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, repeat_action
-from ucfrec_simulators.session_env import SessionsEnv
+from ucfrec_simulators.session_env import AnyEnv, SessionsEnv
 
 ATTRIBUTES: Final = (8, 8, 11, 11, 11, 11, 2, 2, 3, 18, 3)
 """Number of values of each of the eleven user attributes; one-hot, they give the 88 user bits."""
@@ -89,7 +88,7 @@ def split_observations(observations: Float32Array) -> tuple[Float32Array, Float3
     return observations[:, :USER_BITS], observations[:, -1]
 
 
-def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
+def taobao(env: AnyEnv) -> TaobaoEnv:
     """The Taobao environment within `env`.
 
     Raises:
@@ -139,7 +138,7 @@ def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
 
 
 def mix_blends(
-    env: VectorEnv[Any, Any, Any],
+    env: AnyEnv,
     seed: int,
     best: Actor,
     uniform: float,
@@ -157,11 +156,11 @@ def mix_blends(
     return SessionMixture([Uniform(env, seed), *blends], shares, seed)
 
 
-def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
+def zero_actor(env: AnyEnv, seed: int) -> Rule:
     """A policy that always takes the zero action; `seed` is unused."""
     return repeat_action(np.zeros(ACTION_DIM, dtype=np.float32))
 
 
-def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
+def best_constant_actor(env: AnyEnv, seed: int) -> Rule:
     """A non-personalised baseline: always the action of `best_constant`."""
     return repeat_action(best_constant(taobao(env), seed))

@@ -1,14 +1,13 @@
 """A synthetic Taobao environment, without downloads and with a known optimal policy."""
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import Rule, SessionMixture
-from ucfrec_simulators.session_env import draw_categories
+from ucfrec_simulators.session_env import AnyEnv, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -59,15 +58,11 @@ class SyntheticTaobao(TaobaoEnv):
     ) -> tuple[Float32Array, IntArray]:
         """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         uniforms = generator.random((count, len(ATTRIBUTES)))
-        users = np.concatenate(
-            [
-                np.eye(len(shares), dtype=np.float32)[
-                    draw_categories(np.tile(shares, (count, 1)), uniform)
-                ]
-                for shares, uniform in zip(self._popularity, uniforms.T, strict=True)
-            ],
-            axis=1,
-        )
+        bits = []
+        for shares, uniform in zip(self._popularity, uniforms.T, strict=True):
+            values = draw_categories(np.tile(shares, (count, 1)), uniform)
+            bits.append(np.eye(len(shares), dtype=np.float32)[values])
+        users = np.concatenate(bits, axis=1)
         logarithm = 1.5 + users @ self._patience + generator.normal(0, 1.0, count)
         return users, np.clip(np.ceil(np.exp(logarithm)), 1, LONGEST_SESSION).astype(np.int64)
 
@@ -79,7 +74,8 @@ class SyntheticTaobao(TaobaoEnv):
 
     def optimal_actions(self, observations: Float32Array) -> Float32Array:
         """Best actions a* (M, 27) for observations (M, 91)."""
-        return self.best_actions(*split_observations(observations))
+        users, pages = split_observations(observations)
+        return self.best_actions(users, pages)
 
     def expected_clicks(
         self, users: Float32Array, pages: Array, actions: Float32Array
@@ -105,14 +101,14 @@ QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95,
 """Blends of the mixture: quality, noise, share of sessions."""
 
 
-def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
+def optimal(env: AnyEnv, seed: int) -> Rule:
     """The optimal policy, which always takes a*; `seed` is unused."""
     environment = taobao(env)
     assert isinstance(environment, SyntheticTaobao)
     return Rule(environment.optimal_actions)
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant

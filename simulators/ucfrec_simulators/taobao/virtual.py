@@ -1,19 +1,19 @@
 """VirtualTB-v0 (Shi et al., AAAI 2019) with its three published networks, for parallel sessions."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.session_env import data_folder, draw_categories
+from ucfrec_simulators.session_env import AnyEnv, data_folder, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -57,11 +57,11 @@ class VirtualTaobao(TaobaoEnv):
     def __init__(self, folder: Path | str, num_envs: int = 1) -> None:
         super().__init__(num_envs)
         folder = Path(folder)
-        self._generator_model = _load(folder / "generator_model.pt", NOISE_DIM, 128, USER_BITS)
+        self._generator_model = _load(folder / "generator_model.pt", (NOISE_DIM, 128, USER_BITS))
         sizes = (USER_BITS, 128, 256, LONGEST_SESSION + 1)
-        self._leave_model = _load(folder / "leave_model.pt", *sizes)
+        self._leave_model = _load(folder / "leave_model.pt", sizes)
         sizes = (USER_BITS + 1 + ACTION_DIM, 128, 256, CLICK_LEVELS + PAGE_INDICES)
-        self._action_model = _load(folder / "action_model.pt", *sizes)
+        self._action_model = _load(folder / "action_model.pt", sizes)
 
     def sample_users(
         self, count: int, generator: np.random.Generator
@@ -112,7 +112,7 @@ def _weights(logits: torch.Tensor) -> Float32Array:
     return np.asarray((logits - logits.amax(1, keepdim=True)).exp().numpy())
 
 
-def _load(path: Path, *sizes: int) -> nn.Sequential:
+def _load(path: Path, sizes: Sequence[int]) -> nn.Sequential:
     """Load a published state dict into Linear layers of `sizes` with LeakyReLU between them."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
@@ -125,7 +125,7 @@ def _load(path: Path, *sizes: int) -> nn.Sequential:
         network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:
         # torch documents no closed set of errors for a file that is not a state dict.
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path} is not the published network ({reason}); {remedy}") from None
     return network.eval().requires_grad_(False)
 
@@ -134,7 +134,7 @@ QUALITIES: Final = ((0.1, 0.3, 0.30), (0.4, 0.3, 0.20), (0.7, 0.4, 0.15), (0.9, 
 """Blends of the mixture: quality, noise, share of sessions."""
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A quarter of the sessions get uniform actions, the others a blend of an untuned constant and the

@@ -24,9 +24,6 @@ from ucfrec_control.benchmark.methods import (
     METHODS,
     PAPER,
     PURSUING,
-    ROBUST,
-    ROBUSTNESS,
-    SCREENED,
     TABLES,
 )
 from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
@@ -49,12 +46,6 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     return configs
 
 
-def own_rows(table: str, budget: Budget, file: str) -> dict[str, Config]:
-    """`resolved` without the rows of the paper."""
-    configs = resolved(table, budget, file)
-    return {name: config for name, config in configs.items() if name not in PAPER}
-
-
 @pytest.mark.parametrize("size", BUDGETS)
 def test_every_row_of_a_table_is_a_configuration_of_its_own(size: str) -> None:
     """The same in all tables, which share its runs."""
@@ -70,12 +61,13 @@ def test_every_row_of_a_table_is_a_configuration_of_its_own(size: str) -> None:
 
 
 def test_rows_have_the_settings_that_they_are_named_after() -> None:
-    budget = budget_of("gate", "full")
-    file = budget.tasks[0]
-    for name, config in own_rows("lambda", budget, file).items():
+    file = budget_of("gate", "full").tasks[0]
+    rows = {table: resolved(table, budget_of(table, "full"), file) for table in TABLES}
+    paper = {table: [configs.pop(name) for name in PAPER] for table, configs in rows.items()}
+    for name, config in rows["lambda"].items():
         assert config.policy.lambda_mask == float(name.removeprefix("ucf-lambda-"))
     for table in ("gate", "band", "augmentation"):
-        for name, config in own_rows(table, budget, file).items():
+        for name, config in rows[table].items():
             kind = next((k for k in ("faithful", "noise") if name.startswith(k)), "tangent")
             assert config.csg.kind == kind
             assert (config.augment.epsilon_r == 1e9) == name.endswith("wo-gate")
@@ -83,22 +75,19 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
             assert (config.csg.band[0] == 0) == name.endswith("wo-lower")
             assert (config.csg.lambda_band == 0) == name.endswith("wo-band")
             assert (config.augment.edits_per_copy == 1) == ("algorithm-5" in name)
-    for table in TABLES:
-        paper = [resolved(table, budget_of(table, "full"), file)[name] for name in PAPER]
-        assert [config.policy_name for config in paper] == ["ucf-paper", "ucf-paper"]
-        assert [config.augment.edits_per_copy for config in paper] == [0, 1]
-        assert {(c.crm.learning_rate, c.crm.epochs) for c in paper} == {(3e-4, 40)}  # Table 4
-    main = resolved(MAIN, BUDGETS["full"], file)
+    for configs in paper.values():
+        assert [config.policy_name for config in configs] == ["ucf-paper", "ucf-paper"]
+        assert [config.augment.edits_per_copy for config in configs] == [0, 1]
+        assert {(c.crm.learning_rate, c.crm.epochs) for c in configs} == {(3e-4, 40)}  # Table 4
+    main, ablated = rows[MAIN], rows[MAIN]["ucf-wo-arch"]
     assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
-    assert main["ucf-wo-arch"].policy_name == "dt"
-    assert main["ucf-wo-arch"].augment.copies > 0
+    assert (ablated.policy_name, ablated.augment.copies > 0) == ("dt", True)
     for size in BUDGETS:
         timed = resolved(EQUAL_TIME, BUDGETS[size], file)
         steps = {name: config.train.steps for name, config in timed.items()}
         assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
         assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]
-    pursuing = own_rows(PURSUING, BUDGETS["full"], file)
-    for name, config in (pursuing | own_rows(EQUAL_TIME, BUDGETS["full"], file)).items():
+    for name, config in (rows[PURSUING] | rows[EQUAL_TIME]).items():
         if name.startswith("bc"):
             continue
         policy = config.policy
@@ -110,6 +99,13 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
+@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
+def test_what_is_no_context_is_refused(given: str) -> None:
+    assert context_given("ucf=20") == ("ucf", 20)
+    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
+        context_given(given)
+
+
 def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
     small, full = BUDGETS["small"], BUDGETS["full"]
     assert small.fewer_seeds.keys() <= METHODS.keys()
@@ -118,37 +114,19 @@ def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
         assert (seeds, full.seeds_of(file, "cql")) == ([1, 1, 4, 4], of_full)
 
 
-def test_robustness_trains_rows_of_the_benchmark() -> None:
-    trained = {name: method for name, method in ROBUST.items() if name not in SCREENED}
-    assert trained.items() <= METHODS.items()
-    assert {replace(method, screening=None) for method in SCREENED.values()} == {METHODS["ucf"]}
-    assert len(budget_of(ROBUSTNESS, "full").tasks) == 3, "Appendix G.4"
-
-
 def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
     write_made(tmp_path)
     medium = replace(budget_of(MAIN, "medium"), tasks=(MADE,), tasks_of={})
     budget = set_contexts(medium, {"dc-wo-time": 20})
-    contexts = {
-        cell.method: cell.config.policy.context
-        for cell in score_cells(tmp_path, tmp_path / "out", budget, MAIN)
-    }
+    cells = score_cells(tmp_path, tmp_path / "out", budget, MAIN)
+    contexts = {cell.method: cell.config.policy.context for cell in cells}
     assert contexts.pop("dc-wo-time") == 20
     assert {contexts[name] for name in ("ucf", "dt-wo-time")} == {8}
     assert {contexts[name] for name in ("bc", "bc-10", "bc-25")} == {1}
 
 
-@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
-def test_what_is_no_context_is_refused(given: str) -> None:
-    assert context_given("ucf=20") == ("ucf", 20)
-    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
-        context_given(given)
-
-
 @pytest.mark.parametrize("table", TABLES)
-def test_every_row_is_trained_at_the_rate_of_its_policy(
-    table: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_has_the_rate_of_its_policy(table: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
     monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
     for name, method in TABLES[table].items():
@@ -162,24 +140,8 @@ def test_every_row_is_trained_at_the_rate_of_its_policy(
         assert settings[-len(own) :] == own if own else True
 
 
-def test_a_method_with_a_rate_of_its_own_is_trained_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    budget, rates = BUDGETS["small"], {"dt": 0.5, "dt-wo-time": 0.25, "ucf": 0.125}
-    monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
-    for name, rate in (
-        ("dt", "0.5"),
-        ("dt-wo-time", "0.25"),
-        ("ucf-w-time", "0.125"),
-        ("dc", "3e-3"),
-    ):
-        settings = settings_of(budget, name, METHODS[name])
-        chosen = [text for text in settings if text.startswith("train.learning_rate")]
-        assert chosen[-1] == f"train.learning_rate={rate}"
-
-
 @pytest.mark.slow
-def test_the_best_trajectories_are_cloned_and_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_trajectories_are_cloned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Good trajectories act one way and the others the other way: who clones which is seen."""
     columns = hopper_like((30, 8, 25, 20) * 10)
     ends = np.flatnonzero(columns["terminals"] | columns["timeouts"])
@@ -200,12 +162,12 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     assert keys == list(product(range(2), rows, ("last", "best")))
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
-    for method in rows:
-        (run,) = (cell.run for cell in cells if (cell.method, cell.training_seed) == (method, 0))
-        assert run is not None
-        actor = load_run(run, "last").actor(len(seen), DecisionRule(1.0))
+    for cell in cells:
+        if cell.training_seed or cell.run is None:
+            continue
+        actor = load_run(cell.run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))
-        chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
+        chosen[cell.method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
 

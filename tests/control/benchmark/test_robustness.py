@@ -38,24 +38,24 @@ from ucfrec_control.training.screening import ScreeningConfig, screen_states
 from ucfrec_control.training.train import train_control
 
 
-def test_an_early_distractor_tells_of_the_next_reward(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("early", [False, True])
+def test_a_distractor_tells_of_the_reward(folder: Path, tmp_path: Path, early: bool) -> None:
     store = EpisodeStore.open(folder / "store")
-    seen = add_distractor(store, tmp_path / "early", early=True)
-    assert seen.record.source.others["distractors"][0]["early"]
-    every = store.step_values(schema.REWARD, *store.all_steps())
-    for episode, length in enumerate(store.lengths):
-        steps = np.arange(length)
-        rewards = store.step_values(schema.REWARD, np.full(length, episode), steps)
-        high = np.append(rewards[1:], rewards[-1]) > np.median(every)
-        bit = seen.step_values(schema.OBSERVATION, np.full(length, episode), steps)[:, -1]
-        np.testing.assert_array_equal(bit, high)
+    # Every twentieth trajectory is for validation.
+    assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
+    seen = add_distractor(store, tmp_path / "distracted", early=early)
+    assert seen.record.source.others["distractors"][0]["early"] == early
+    episodes, steps = store.all_steps()
+    told = np.minimum(steps + early, store.lengths[episodes] - 1)
+    median = np.median(store.step_values(schema.REWARD, episodes, steps))
+    high = store.step_values(schema.REWARD, episodes, told) > median
+    before, shown = (s.step_values(schema.OBSERVATION, episodes, steps) for s in (store, seen))
+    np.testing.assert_array_equal(shown, np.column_stack([before, high]))
 
 
 def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> None:
-    rows = [
-        row("none", 50.0), row("early", 20.0), row("stochastic", 40.0),
-        row("none", 100.0, seed=1), row("early", 80.0, seed=1), row("stochastic", 10.0, seed=1),
-    ]  # fmt: skip
+    scores = {"none": (50.0, 100.0), "early": (20.0, 80.0), "stochastic": (40.0, 10.0)}
+    rows = [row(kind, scores[kind][seed], seed=seed) for kind in scores for seed in (0, 1)]
     # Lost at 0: early 60 and 20%, stochastic 20 and 90%; at 1, where twice large a return is
     # reached: early 20 and −60%, stochastic −60 and 80%.
     (line,) = largest_drops(rows)
@@ -63,10 +63,9 @@ def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> 
 
 
 def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> ResultRow:
-    return result_row(
-        score, suite="robustness", task="d", method=method, training_seed=seed, metric="score",
-        conditions={"distractor": distractor}, metrics={"score_at_one": 2 * score},
-    )  # fmt: skip
+    own = {"conditions": {"distractor": distractor}, "metrics": {"score_at_one": 2 * score}}
+    own |= {"suite": "robustness", "task": "d", "method": method, "metric": "score"}
+    return result_row(score, training_seed=seed, **own)
 
 
 def test_drops_compare_with_the_same_seed_without_distractor() -> None:
@@ -79,7 +78,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
     assert (early["score_at_one"], early["drop_at_one"]) == (40.0, 50.0)
-    assert found["stochastic", 0]["drop"] == -25.0
+    assert found["stochastic", 0]["drop"] == -25
     assert math.isnan(found["early", 1]["drop"])
 
 
@@ -94,11 +93,8 @@ def screenable() -> Columns:
     return columns
 
 
-def begin(
-    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> dict[tuple[str, str], Path]:
-    """A small table of one file and one distractor, its screened runs begun in `out`; returns the
-    run of each distractor and method."""
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str], Path]:
+    """Screened runs of a file and a distractor begun in `out`, by distractor and method."""
     budget = Budget("small", (MADE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
     monkeypatch.setitem(BUDGETS, "small", budget)
     monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
@@ -109,22 +105,19 @@ def begin(
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
     runs, stages = {}, SharedStages(tmp_path / "stages")
-    for cell in plan.robustness_cells(tmp_path, out, budget):
+    for cell in plan.robustness_cells(tmp_path, tmp_path / "out", budget):
         assert cell.run is not None
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
-            train_control(
-                open_store(cell), cell.run, cell.config, screening=cell.screening, shared=stages
-            )
+            own = {"screening": cell.screening, "shared": stages}
+            train_control(open_store(cell), cell.run, cell.config, **own)
     return runs
 
 
 @pytest.mark.slow
-def test_cells_are_measured_once_and_screening_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, results = tmp_path / "out", tmp_path / "rows.jsonl"
-    runs = begin(tmp_path, out, monkeypatch)
+    runs = begin(tmp_path, monkeypatch)
     command = ("robustness", "--data", tmp_path, "--out", out, "--results", results)
     printed = control(*command)[0]
     rows, before = read_rows(results), results.read_text()
@@ -136,12 +129,8 @@ def test_cells_are_measured_once_and_screening_is_reported(
         kind = str(r.conditions["distractor"])
         for value, name in ((0.0, "score"), (1.0, "score_at_one")):
             fixed = value if kind != "none" else 0.0
-            assert r.target_return is not None
-            (again,) = evaluate_run(
-                runs[kind, r.method],
-                episodes=2, seed=1000, targets=[r.target_return], checkpoints=("last",),
-                distractor=fixed,
-            )  # fmt: skip
+            own = {"targets": [r.target_return], "checkpoints": ("last",), "distractor": fixed}
+            (again,) = evaluate_run(runs[kind, r.method], episodes=2, seed=1000, **own)
             assert again["score"] == r.metrics[name]
             assert again["distractor_fixed_to"] == fixed
         blind = kind == "none" or r.method == "ucf-dropped"
@@ -171,9 +160,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
     assert control("robustness", "--show-only", "--results", results)[0] == printed
 
 
-def test_training_with_screening_records_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_screening_is_recorded_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Predictors this small reach no larger share of the reward.
     config = replace(QUICK, hidden=8, min_reward_r2=0.5)
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)

@@ -42,19 +42,14 @@ def test_one_command_makes_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
     for part in PARTS.values():
         robust = part.table == ROBUSTNESS
+        shared = LAST | {"suite": part.table if robust else SCORES, "table": part.table}
         rows = [
-            result_row(
-                10.0 * number + seed,
-                **LAST | {"suite": ROBUSTNESS if robust else SCORES},
-                table=part.table,
-                task="d",
-                method=method,
-                training_seed=seed,
-                conditions=small(distractor=distractor, lambda_mask=number / 10),
-            )
-            for number, method in enumerate(part.methods or TABLES[part.table])
+            result_row(10.0 * n + seed, **shared, task="d", method=method, **own)
+            for n, method in enumerate(part.methods or TABLES[part.table])
             for distractor in part.distractors or (None,)
+            for conditions in [small(distractor=distractor, lambda_mask=n / 10)]
             for seed in range(2)
+            for own in [{"training_seed": seed, "conditions": conditions}]
         ]
         made = {file.name for file in make_row_figures(rows, tmp_path)}
         wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
@@ -67,22 +62,12 @@ def small(**conditions: object) -> dict[str, object]:
 
 
 def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -> None:
+    of = LAST | {"task": "hopper_medium-zoo"}
     rows = [
-        result_row(
-            score,
-            **LAST,
-            table=table,
-            task="hopper_medium-zoo",
-            method=method,
-            training_seed=0,
-            conditions={"budget": budget},
-        )
-        for table, method, budget, score in (
-            (MAIN, "ucf", "small", 41.5),
-            (MAIN, "bc", "small", 42.5),
-            (MAIN, "ucf", "full", 43.5),
-            ("lambda", "ucf", "small", 44.5),
-        )
+        result_row(41.5, **of, table=MAIN, method="ucf", conditions=small()),
+        result_row(42.5, **of, table=MAIN, method="bc", conditions=small()),
+        result_row(43.5, **of, table=MAIN, method="ucf", conditions={"budget": "full"}),
+        result_row(44.5, **of, table="lambda", method="ucf", conditions=small()),
     ]
     results = tmp_path / "rows.jsonl"
     append_rows(results, rows)
@@ -94,23 +79,17 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -
     assert "drawn from its runs" in refused("reproduce", "figure-5", *asked)
 
 
-@pytest.mark.parametrize(
-    ("command", "suite", "conditions", "lacking"),
-    [
+def test_rows_that_lack_what_is_shown_are_one_clear_error(tmp_path: Path) -> None:
+    for command, suite, conditions, lacking in (
         ("benchmark", SCORES, {}, "budget"),
         ("robustness", ROBUSTNESS, small(), "distractor"),
-    ],
-)
-def test_rows_that_lack_what_is_shown_are_one_clear_error(
-    tmp_path: Path, command: str, suite: str, conditions: dict[str, object], lacking: str
-) -> None:
-    results = tmp_path / "rows.jsonl"
-    row = result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)
-    append_rows(results, [row])
-    said = refused(command, "--show-only", "--results", results)
-    assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
-    said = refused("figures", "--results", results, "--out", tmp_path / "out")
-    assert f"{results} is damaged" in said
+    ):
+        results = tmp_path / f"{command}.jsonl"
+        append_rows(results, [result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)])
+        said = refused(command, "--show-only", "--results", results)
+        assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
+        said = refused("figures", "--results", results, "--out", tmp_path / "out")
+        assert f"{results} is damaged" in said
 
 
 def test_names_of_foreign_rows_do_not_steer_the_terminal(tmp_path: Path) -> None:

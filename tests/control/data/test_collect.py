@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -22,25 +23,14 @@ from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_kind
 
 ENV = "InvertedPendulum-v5"
-CONFIG = CollectConfig(
-    steps=360,
-    every=90,
-    episodes=20,
-    size=400,
-    fraction=0.5,
-    sac=SacConfig(learning_starts=60, batch_size=64, hidden=32, learning_rate=3e-3),
-)
+SAC = SacConfig(learning_starts=60, batch_size=64, hidden=32, learning_rate=3e-3)
+CONFIG = CollectConfig(steps=360, every=90, episodes=20, size=400, fraction=0.5, sac=SAC)
 NAMES = ("medium", "medium-replay", "expert", "medium-expert")
 FIELDS = ("observations", "actions", "rewards", "lengths", "terminated", "final_observations")
 
 
 def read(folder: Path, kind: str) -> Trajectories:
     return read_d4rl(folder / f"invertedpendulum_{kind}-sac.hdf5")
-
-
-def assert_equal(first: Trajectories, second: Trajectories) -> None:
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +40,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_medium_is_the_first_policy_past_the_threshold(collected: Path) -> None:
+def test_medium_is_the_first_past_the_threshold_and_replay_all_before_it(collected: Path) -> None:
     said = json.loads((collected / "MANIFEST.json").read_text())
     sac = SacTraining(module.make_env(ENV, 1), 3, 10, CONFIG.sac)
     files = sorted((collected / "training").glob("policy-*.safetensors"))
@@ -60,10 +50,6 @@ def test_medium_is_the_first_policy_past_the_threshold(collected: Path) -> None:
     before = [row["return"] for row in about if row["steps"] < said["medium_steps"]]
     assert said["medium_return"] >= threshold > max(before, default=-np.inf)
     assert said["expert_return"] > said["random_return"]
-
-
-def test_replay_is_every_training_step_up_to_medium(collected: Path) -> None:
-    said = json.loads((collected / "MANIFEST.json").read_text())
     replay = read(collected, "medium-replay")
     assert len(replay.rewards) == replay.lengths.sum() == said["medium_steps"]
     # The first steps are uniform, over the pendulum's own range of ±3.
@@ -163,19 +149,20 @@ def test_an_interrupted_collection_ends_as_an_uninterrupted_one(
     assert not list((tmp_path / "out").glob("*.hdf5"))
     collect(ENV, tmp_path / "out", 3, CONFIG)
     assert evaluations == 5
-    for kind in NAMES:
-        assert_equal(read(collected, kind), read(tmp_path / "out", kind))
+    for kind, name in product(NAMES, FIELDS):
+        whole, resumed = (getattr(read(at, kind), name) for at in (collected, tmp_path / "out"))
+        np.testing.assert_array_equal(whole, resumed, err_msg=name)
 
 
 def test_bad_input_is_refused(collected: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="complete already"):
-        collect(ENV, collected, 3, CONFIG)
-    with pytest.raises(InputError, match="fraction is 1"):
-        collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, fraction=1))
-    with pytest.raises(InputError, match="learning starts after 60"):
-        collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, steps=60))
-    with pytest.raises(InputError, match="actions in a box"):
-        collect("CartPole-v1", tmp_path / "cart", 3, CONFIG)
+    for says, env, out, changes in (
+        ("complete already", ENV, collected, {}),
+        ("fraction is 1", ENV, tmp_path / "out", {"fraction": 1}),
+        ("learning starts after 60", ENV, tmp_path / "out", {"steps": 60}),
+        ("actions in a box", "CartPole-v1", tmp_path / "cart", {}),
+    ):
+        with pytest.raises(InputError, match=says):
+            collect(env, out, 3, dataclasses.replace(CONFIG, **changes))
     assert list(tmp_path.iterdir()) == []
     (collected / "MANIFEST.json").rename(tmp_path / "MANIFEST.json")
     with pytest.raises(InputError, match="started with other settings"):

@@ -5,6 +5,7 @@ import warnings
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import minari
@@ -34,18 +35,16 @@ ENVIRONMENTS = (REBUILT, "AntMaze_UMaze-v4")
 D4RL_MAZES = {
     "umaze": "##### #S..# ###.# #G..# #####",
     "medium": "######## #S.##..# #..#...# ##...### #..#...# #.#..#.# #...#.G# ########",
-    "large": (
-        "############ #S...#.....# #.##.#.#.#.# #......#...# #.####.###.# #..#.#.....# "
-        "##.#.#.#.### #..#...#.G.# ############"
-    ),
+    "large": "############ #S...#.....# #.##.#.#.#.# #......#...# #.####.###.# #..#.#.....# "
+    "##.#.#.#.### #..#...#.G.# ############",
 }
 
 
-def simulated(env: gymnasium.vector.SyncVectorEnv) -> Float64Array:
+def simulated(env: Any) -> Float64Array:
     """What D4RL shows of every environment: qpos, then qvel of the ant."""
     seen = []
     for one in env.envs:
-        data = one.unwrapped.ant_env.data  # type: ignore[attr-defined]
+        data = one.unwrapped.ant_env.data
         position = data.qpos[:2] - getattr(one.unwrapped, "origin", 0.0)
         seen.append(np.concatenate([position, data.qpos[2:15], data.qvel[:14]]))
     return np.array(seen)
@@ -54,21 +53,16 @@ def simulated(env: gymnasium.vector.SyncVectorEnv) -> Float64Array:
 def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
     """A D4RL AntMaze file's: floats throughout, no successors."""
     rng, n, hopper = np.random.default_rng(0), sum(lengths), hopper_like(lengths)
-    terminals, timeouts = (hopper[name].astype(np.float32) for name in ("terminals", "timeouts"))
-    return {
-        "observations": rng.normal(size=(n, 29)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, size=(n, 8)).astype(np.float32),
-        "rewards": terminals,
-        "terminals": terminals,
-        "timeouts": timeouts,
-    }
+    columns = {name: hopper[name] for name in ("terminals", "timeouts")}
+    columns |= {"rewards": columns["terminals"], "observations": rng.normal(size=(n, 29))}
+    columns["actions"] = rng.uniform(-1, 1, size=(n, 8))
+    return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
 @needs_robotics
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_path: Path) -> None:
     env = make_env(env_id, 2)
-    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
     rng = np.random.default_rng(0)
     shown, d4rl, actions = [env.reset(seed=0)[0]], [simulated(env)], []
     for _ in range(6):
@@ -76,14 +70,10 @@ def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_p
         shown.append(env.step(actions[-1])[0])
         d4rl.append(simulated(env))
     env.close()
-    ends = np.arange(12) % 6 == 5
-    columns = {
-        "observations": np.concatenate(np.array(d4rl)[:-1].swapaxes(0, 1)),
-        "actions": np.concatenate(np.array(actions).swapaxes(0, 1)),
-        "rewards": np.zeros(12),
-        "terminals": np.zeros(12),
-        "timeouts": ends.astype(float),
-    }
+    columns = dict.fromkeys(("rewards", "terminals"), np.zeros(12))
+    columns["timeouts"] = (np.arange(12) % 6 == 5).astype(float)
+    for name, values in (("observations", d4rl[:-1]), ("actions", actions)):
+        columns[name] = np.concatenate(np.array(values).swapaxes(0, 1))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", columns, env_id=None)
     store = read_d4rl(file).write_store(tmp_path / "store")
     stored = store.windows(np.arange(2), np.full(2, 5), 6).states.numpy()
@@ -95,10 +85,9 @@ def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_p
 @pytest.mark.parametrize(("maze", "limit"), [("umaze", 700), ("medium", 1000), ("large", 1000)])
 def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     env_id = f"d4rl/antmaze-{maze}-v2"
-    env = make_env(env_id, 1)
-    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    env: Any = make_env(env_id, 1)
     environment = env.envs[0].unwrapped
-    model = environment.ant_env.model  # type: ignore[attr-defined]
+    model = environment.ant_env.model
     # D4RL: the cell of row i and column j is at (4j − 4, 4i − 4), so that the start is at (0, 0).
     cells = {
         (4 * j - 4, 4 * i - 4): cell
@@ -108,19 +97,18 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     wanted = {at for at, cell in cells.items() if cell == "#"}
     names = [model.geom(i).name for i in range(model.ngeom)]
     blocks = [i for i, name in enumerate(names) if name.startswith("block")]
-    found = model.geom_pos[blocks, :2] - environment.origin  # type: ignore[attr-defined]
+    found = model.geom_pos[blocks, :2] - environment.origin
     assert {(round(x), round(y)) for x, y in found} == wanted
     assert gymnasium.spec(env_id).max_episode_steps == limit
     assert (model.opt.timestep, set(model.actuator_gear[:, 0])) == (0.02, {30.0})
     starts, goals = [], []
     for seed in range(30):
         starts.append(env.reset(seed=seed)[0][0, :2])
-        goals.append(environment.goal - environment.origin)  # type: ignore[attr-defined]
+        goals.append(environment.goal - environment.origin)
     env.close()
     (goal,) = (at for at, cell in cells.items() if cell == "G")
     off = np.array(goals) - goal
-    assert off.min() >= 0
-    assert off.max() <= 1.5
+    assert 0 <= off.min() <= off.max() <= 1.5
     assert np.ptp(off, axis=0).min() > 1
     assert 0.05 < np.abs(starts).max() <= 0.1
 
@@ -128,17 +116,15 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
 class Teleported(Memoryless):
     """Stands still until step 3, when every second ant is put on its goal."""
 
-    def __init__(self, env: gymnasium.vector.SyncVectorEnv) -> None:
-        self._env = env
-        self._steps = 0
+    def __init__(self, env: Any) -> None:
+        self._env, self._steps = env, 0
 
     def act(self, observations: object, live: object) -> tuple[Float32Array, None]:
         self._steps += 1
         if self._steps == 3:
             for one in self._env.envs[::2]:
-                environment = one.unwrapped
-                ant = environment.ant_env  # type: ignore[attr-defined]
-                there = np.concatenate([environment.goal, ant.data.qpos[2:]])  # type: ignore[attr-defined]
+                ant = one.unwrapped.ant_env
+                there = np.concatenate([one.unwrapped.goal, ant.data.qpos[2:]])
                 ant.set_state(there, ant.data.qvel)
         return np.zeros((self._env.num_envs, 8), dtype=np.float32), None
 
@@ -147,7 +133,6 @@ class Teleported(Memoryless):
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_a_success_ends_the_episode_and_scores_a_hundred(env_id: str) -> None:
     env = make_env(env_id, 4, settings={"max_episode_steps": 8})
-    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
     played = rollout(env, Teleported(env), 4, seed=0)
     env.close()
     assert played.returns.tolist() == [1, 0, 1, 0]
@@ -179,9 +164,7 @@ def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(run: Path, tmp_path:
 
 
 @needs_robotics
-def test_minari_mazes_are_those_of_the_data(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mazes_are_of_the_data(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     antmaze_settings("AntMaze_UMaze-v4")
     maze = [[1] * 5, [1, "g", 0, 0, 1], [1, 1, 1, 0, 1], [1, "r", 0, 0, 1], [1] * 5]
@@ -228,9 +211,7 @@ def test_names_of_d4rl_tell_its_environments() -> None:
     assert find_kind("antmaze-medium-diverse-v2") == "diverse"
 
 
-def test_without_gymnasium_robotics_one_line_says_what_to_install(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_robotics_the_extra_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     needs = f"{REBUILT} needs gymnasium-robotics, which is not installed; install ucfrec[antmaze]"
     assert needs in refused("evaluate", run)
@@ -239,9 +220,7 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
 
 
 @needs_robotics
-def test_d4rl_files_keep_their_environment_in_minari(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_d4rl_files_keep_their_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
     control("convert", file, "antmaze/mine-v0")

@@ -120,16 +120,14 @@ def test_cql_has_the_settings_of_corl() -> None:
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
 @pytest.mark.parametrize("task", ["hopper", "antmaze"])
 def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
-    agents = [
-        agent_of(task, "medium", algorithm, **settings)
-        for settings in ({}, {"learning_rate": 3e-3})
-    ]
-    usual, ten = (
-        {name: rate for name, rate in vars(agent.config).items() if name.endswith("learning_rate")}
-        for agent in agents
-    )
+    def rates(**settings: float) -> dict[str, float]:
+        config = vars(agent_of(task, "medium", algorithm, **settings).config)
+        return {name: rate for name, rate in config.items() if name.endswith("learning_rate")}
+
+    usual = rates()
     assert usual["critic_learning_rate"] == 3e-4
-    assert ten == pytest.approx({name: 10 * rate for name, rate in usual.items()})
+    ten_times = {name: 10 * rate for name, rate in usual.items()}
+    assert rates(learning_rate=3e-3) == pytest.approx(ten_times)
 
 
 def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:

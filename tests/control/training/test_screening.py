@@ -29,6 +29,9 @@ def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None
     assert abs(by_dimension[3].effect) < 0.03
     assert by_dimension[3].reward_effect < 0.01
     assert screen_states(store.split("train"), FAST, seed=0) == report
+    few = planted_vectors(tmp_path / "few", trajectories=8)
+    with pytest.raises(InputError, match="screening needs at least 15"):
+        screen_states(few.split("train"), FAST, seed=0)
 
 
 def test_a_few_violent_steps_do_not_decide(tmp_path: Path) -> None:
@@ -57,9 +60,3 @@ def test_weak_causes_of_a_noisy_reward_are_kept(tmp_path: Path) -> None:
     # Taken as evidence, the same help would do away with the category.
     trusting = screen_states(store.split("train"), replace(FAST, min_reward_r2=0.5), seed=0)
     assert set(trusting.flagged) >= {1, 2, 3, 4, 5, 6}
-
-
-def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:
-    store = planted_vectors(tmp_path / "store", trajectories=8)
-    with pytest.raises(InputError, match="screening needs at least 15"):
-        screen_states(store.split("train"), FAST, seed=0)

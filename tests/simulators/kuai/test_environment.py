@@ -65,17 +65,8 @@ def test_every_exit_agrees_with_a_plain_reading(
         np.testing.assert_array_equal(paid, rewards[users, actions])
         assert list(zip(terminated, terminated | truncated, strict=True)) == expected
         np.testing.assert_array_equal(boring, terminated)
-        sessions = [
-            Plain(tags, rule) if over else session
-            for session, (_, over) in zip(sessions, expected, strict=True)
-        ]
-
-
-def test_the_sliced_window_of_ten_sees_one_item_in_step_nine() -> None:
-    turns = np.arange(13)
-    sliced = ExitRule(10, 0, 30, sliced=True).reach(turns)
-    assert sliced.tolist() == [0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 10, 10, 10]
-    assert ExitRule(10, 0, 30).reach(turns).tolist() == [*range(11), 10, 10]
+        ends = [over for _, over in expected]
+        sessions = [Plain(tags, rule) if e else s for s, e in zip(sessions, ends, strict=True)]
 
 
 def small(num_envs: int = 6, items: int = 40, rule: str = "dorl", regime: str = "FB") -> KuaiEnv:
@@ -144,7 +135,11 @@ def test_uniform_choice_among_allowed_items_is_uniform() -> None:
     assert info[FORBIDDEN].shape == (20_000, 30)
 
 
-def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
+def test_what_does_not_fit_a_masked_item_and_a_deaf_actor_are_refused() -> None:
+    with pytest.raises(InputError, match="5 items are too few for a session of 10"):
+        small(1, items=5, regime="NX_10")
+    with pytest.raises(InputError, match=r"3 users × 4 items, .* tags of 5 items"):
+        KuaiEnv(1, np.zeros((3, 4), np.float32), [()] * 5, EXITS["cirs"])
     env = small(2, regime="NX_10")
     env.reset(seed=0)
     env.step(np.array([3, 4]))
@@ -154,17 +149,9 @@ def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
         rollout(env, repeat_action(np.zeros(1, np.float32)), 2, 0)
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="5 items are too few for a session of 10"):
-        small(1, items=5, regime="NX_10")
-    with pytest.raises(InputError, match=r"3 users × 4 items, .* tags of 5 items"):
-        KuaiEnv(1, np.zeros((3, 4), np.float32), [()] * 5, EXITS["cirs"])
-
-
 @pytest.mark.parametrize("regime", REGIMES)
 def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
-    """Its catalogue has items that the environment lacks, and lacks some that the environment
-    has."""
+    """Each has items that the other lacks."""
     env = small(4, regime=regime)
     numbers = np.concatenate([np.arange(39, 4, -1), [-1] * 6])
     embeddings = torch.randn(len(numbers), 3, generator=torch.Generator().manual_seed(0))
@@ -187,9 +174,8 @@ def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
 @pytest.mark.parametrize("rule", RULES, ids=str)
 def test_logs_are_cut_where_their_users_would_have_left(rule: ExitRule) -> None:
     rng = np.random.default_rng(5)
-    tags = [
-        tuple(rng.choice(9, size=rng.integers(0, 3), replace=False).tolist()) for _ in range(30)
-    ]
+    sizes = rng.integers(0, 3, size=30)
+    tags = [tuple(rng.choice(9, size=size, replace=False).tolist()) for size in sizes]
     users = np.repeat(rng.permutation(12), rng.integers(1, 80, size=12))
     items = rng.integers(30, size=len(users))
     expected, number = [], -1
@@ -220,7 +206,6 @@ def test_items_are_found_by_what_the_logs_call_them(tmp_path: Path) -> None:
     collect(simulator, env, Uniform(env, 0), 20, 0, tmp_path / "logs", env_name="", behavior="")
     log = pd.read_parquet(tmp_path / "logs" / "sessions.parquet")
     assert set(log["item_id"]) <= set(env.item_ids.tolist())
-    paid = env.rewards[
-        np.searchsorted(env.user_ids, log["user_id"]), (217 - log["item_id"].to_numpy()) // 3
-    ]
+    users, items = np.searchsorted(env.user_ids, log["user_id"]), (217 - log["item_id"]) // 3
+    paid = env.rewards[users, items.to_numpy()]
     np.testing.assert_array_equal(paid, log["pay"])

@@ -30,13 +30,9 @@ QUICK = CompletionConfig(steps=300, dropout=0.2, learning_rate=1e-2)
 def planted_store(folder: Path, seed: int = 0, clicks: str = "planted") -> EpisodeStore:
     """Two kinds of users, each of whom clicks one half of the items nine times of ten."""
     rng = np.random.default_rng(seed)
-    log = pd.DataFrame(
-        {
-            "user_id": rng.integers(USERS, size=6000) + 100,
-            "item_id": rng.integers(ITEMS, size=6000),
-            "timestamp": 1_650_000_000_000 + np.arange(6000) * 60_000,
-        }
-    )
+    log = pd.DataFrame({"user_id": rng.integers(USERS, size=6000) + 100})
+    log["item_id"] = rng.integers(ITEMS, size=6000)
+    log["timestamp"] = 1_650_000_000_000 + np.arange(6000) * 60_000
     liked = log["user_id"] % 2 == log["item_id"] % 2
     log["is_click"] = (rng.random(6000) < np.where(liked, 0.9, 0.1)).astype(int)
     if clicks == "ratings":
@@ -53,9 +49,8 @@ def test_planted_clicks_are_found_and_the_environment_pays_them(tmp_path: Path) 
     assert report.log_loss < 0.45 < report.base_log_loss
     assert report.calibration_error < 0.06
     assert (report.users, report.items) == (USERS, ITEMS)
-    assert (
-        json.loads((tmp_path / "environment" / "completion.json").read_text())["auc"] == report.auc
-    )
+    written = json.loads((tmp_path / "environment" / "completion.json").read_text())
+    assert written["auc"] == report.auc
     env = kuairand(16, tmp_path / "environment")
     assert env.tags[0] == (-1,)
     assert env.tags[6] == (6,)
@@ -68,9 +63,7 @@ def test_planted_clicks_are_found_and_the_environment_pays_them(tmp_path: Path) 
     assert best > 2 * rollout(env, Uniform(env, 0), 64, 0).returns.mean()
 
 
-def test_the_same_seed_gives_the_same_files_and_nothing_is_left_of_a_failure(
-    tmp_path: Path,
-) -> None:
+def test_equal_seeds_give_equal_files_and_nothing_is_left_of_a_failure(tmp_path: Path) -> None:
     store = planted_store(tmp_path / "log")
     for name in "ab":
         torch.manual_seed(ord(name))
@@ -88,7 +81,7 @@ def test_the_same_seed_gives_the_same_files_and_nothing_is_left_of_a_failure(
 
 @pytest.mark.slow
 @pytest.mark.realdata
-def test_real_rows_make_a_environment_that_can_be_believed(
+def test_real_rows_make_a_good_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Evaluated on 29–30 April; what policies learn from, the days before, stays out."""

@@ -11,11 +11,8 @@ from ucfrec_simulators.taobao.cirs import SIMULATOR, CirsTaobao
 pytestmark = pytest.mark.realdata
 
 
-def test_gymnasium_accepts_it() -> None:
-    check_environment(CirsTaobao(data_folder("virtualtaobao")))
-
-
 def test_exits_and_observations_agree_with_a_plain_reading() -> None:
+    check_environment(CirsTaobao(data_folder("virtualtaobao")))
     env = CirsTaobao(data_folder("virtualtaobao"), 8, max_turn=12)
     first, _ = env.reset(seed=0)
     rng = np.random.default_rng(1)
@@ -44,8 +41,7 @@ def test_exits_and_observations_agree_with_a_plain_reading() -> None:
 
 def test_a_constant_policy_bores_on_its_second_page() -> None:
     env = SIMULATOR.make(64, data_folder("virtualtaobao"))
-    lengths = {
-        b: rollout(env, SIMULATOR.behaviors[b](env, 0), 100, 0).lengths for b in ("zero", "random")
-    }
-    assert (lengths["zero"] == 2).all()
-    assert 10 < lengths["random"].mean() <= 50
+    actors = (SIMULATOR.behaviors[name](env, 0) for name in ("zero", "random"))
+    zero, random = (rollout(env, actor, 100, 0).lengths for actor in actors)
+    assert (zero == 2).all()
+    assert 10 < random.mean() <= 50

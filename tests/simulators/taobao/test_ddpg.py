@@ -47,9 +47,7 @@ def reference_density(actions: Float32Array, mean: Float32Array, scale: float) -
     scale=st.floats(0.05, 2),
     seed=st.integers(0, 99),
 )
-def test_the_density_is_that_of_a_truncated_normal(
-    mean: list[float], scale: float, seed: int
-) -> None:
+def test_the_density_is_of_a_truncated_normal(mean: list[float], scale: float, seed: int) -> None:
     means = np.tile(np.array(mean, dtype=np.float32), (20, 1))
     actions, density = truncated_normal(means, scale, np.random.default_rng(seed))
     assert np.abs(actions).max() <= 1
@@ -88,9 +86,8 @@ def test_what_it_learns_from_is_what_is_logged() -> None:
     np.testing.assert_array_equal(held["actions"], logged["actions"])
     np.testing.assert_allclose(buffer.rewards[:learned, 0] * 10, logged["rewards"], atol=1e-5)
     np.testing.assert_array_equal(buffer.dones[:learned, 0] > 0, logged["terminated"])
-    goes_on = ~logged["terminated"]
-    after = buffer.next_observations[:learned, 0][goes_on] * high
-    np.testing.assert_allclose(after, logged["next_observations"][goes_on], atol=1e-5)
+    after, goes_on = buffer.next_observations[:learned, 0] * high, ~logged["terminated"]
+    np.testing.assert_allclose(after[goes_on], logged["next_observations"][goes_on], atol=1e-5)
 
 
 class Slope(SyntheticTaobao):

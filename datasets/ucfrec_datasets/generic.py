@@ -26,8 +26,8 @@ def _resolve(paths: Sequence[str | Path], mapping: LogMapping) -> Resolved:
     mapping = mapping.over(defaults)
     # A table with `first_by`, of several rows per item or user, may be the log itself.
     tables = (*mapping.item_features, *mapping.user_features)
-    named = (file for t in tables if not t.first_by for file in log_files(t.files))
-    features = {file.resolve() for file in (*items, *users, *named)}
+    table_files = (file for t in tables if not t.first_by for file in log_files(t.files))
+    features = {file.resolve() for file in (*items, *users, *table_files)}
     logs = tuple(file for file in files if file.resolve() not in features)
     if not logs:
         raise InputError(

@@ -88,12 +88,12 @@ class Table:
     @classmethod
     def read(cls, options: argparse.Namespace) -> Self:
         """The table with the values of a command line."""
-        return cls(**{each.name: getattr(options, each.name) for each in fields(cls)})  # type: ignore[arg-type]
+        return cls(**{field.name: getattr(options, field.name) for field in fields(cls)})  # type: ignore[arg-type]
 
 
 def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[str, Any]:
     """The fields of a settings table that the command line names."""
-    values = {each.name: getattr(options, prefix + each.name, None) for each in fields(table)}
+    values = {field.name: getattr(options, prefix + field.name, None) for field in fields(table)}
     return {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in values.items()
@@ -154,8 +154,8 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
         if several or not required:
             how["nargs"] = "?" if not several else "+" if required else "*"
     elif several:
-        many = metavar is not None and metavar.endswith("…")
-        how |= {"action": "extend", "nargs": "+"} if many else {"action": "append"}
+        takes_several = metavar is not None and metavar.endswith("…")
+        how |= {"action": "extend", "nargs": "+"} if takes_several else {"action": "append"}
     elif required:
         how["required"] = True
     if metavar is not None:

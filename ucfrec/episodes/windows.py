@@ -439,12 +439,12 @@ class AugmentedEpisodes:
         _require_below(self.edit_copy, len(self.copy_source), "a copy")
         episodes, lengths = store.record.n_episodes, store.whole.lengths
         edited = self.copy_source[self.edit_copy]
-        for source, own, step in (
+        for source, copy_step, step in (
             (self.copy_source, edited, self.edit_step),
             (self.action_source, self.action_source, self.action_step),
         ):
             _require_below(source, episodes, "an episode")
-            _require_below(step, lengths[own], "a step")
+            _require_below(step, lengths[copy_step], "a step")
         copy_changes = np.diff(self.edit_copy)
         if (copy_changes < 0).any() or (np.diff(self.edit_step)[copy_changes == 0] <= 0).any():
             raise ValueError("its edits are not in order")

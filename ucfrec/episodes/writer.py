@@ -96,8 +96,8 @@ class StoreWriter:
         self._hash("first", first[rows].view(np.uint8))
         self._offsets.append(starts + self._steps_in_shard)
         split = np.asarray(episodes[schema.SPLIT])[rows]
-        for each, counted in enumerate((split[starts], split)):
-            self._split_counts[:, each] += np.bincount(counted, minlength=len(schema.SPLITS))
+        for place, counted in enumerate((split[starts], split)):
+            self._split_counts[:, place] += np.bincount(counted, minlength=len(schema.SPLITS))
         self._steps_in_shard += len(split)
 
     @property

@@ -160,16 +160,16 @@ def _survey_ids(
     for name, table, file in ID_TABLES:
         old_count = pq.read_metadata(store / file).num_rows
         is_new = f"number >= {old_count}"
-        used = f"used_{table} JOIN {table} USING ({name})"
+        used_ids = f"used_{table} JOIN {table} USING ({name})"
         ids, new, steps = typed.one(
             f"SELECT count(*), count(*) FILTER ({is_new}), "
-            f"CAST(coalesce(sum(steps) FILTER ({is_new}), 0) AS BIGINT) FROM {used}"
+            f"CAST(coalesce(sum(steps) FILTER ({is_new}), 0) AS BIGINT) FROM {used_ids}"
         )
         # New ids are usual here; only logs without any old one may be written in another way.
         if new == ids:
             note_unknown(typed.name, name, new, ids, f"of {store}")
         tables, whose = feature_tables(mapping)[name], name.removesuffix("_id")
-        rows = f"(SELECT {name} FROM {used} WHERE {is_new})"
+        rows = f"(SELECT {name} FROM {used_ids} WHERE {is_new})"
         note_lacking(typed.connection, tables, log.features[name], name, rows, f"new {whose}s")
         if new and not tables and name in old.source.features:
             warn_user(

@@ -183,10 +183,10 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
     try:
         # DuckDB would read some names that are not columns as the current user or time.
         types = {}
-        for read in columns_of(connection, expression):
-            if read.casefold() not in names:
-                raise _missing(table, what, read)
-            name = names[read.casefold()]
+        for written in columns_of(connection, expression):
+            if written.casefold() not in names:
+                raise _missing(table, what, written)
+            name = names[written.casefold()]
             types[name] = columns[name]
         sql = f"({expression}\n)"
         try:

@@ -121,8 +121,8 @@ class Histories:
         """The same users with only some rows: their numbers, or (N,) true for them."""
         names = ("owner", "item_ids", "rewards", "timestamps", "session_ids")
         columns = {name: getattr(self, name) for name in names}
-        kept = {name: values[rows] for name, values in columns.items() if values is not None}
-        return replace(self, **kept)
+        arrays = {name: values[rows] for name, values in columns.items() if values is not None}
+        return replace(self, **arrays)
 
 
 def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
@@ -184,8 +184,8 @@ def frame_histories(
     columns = log_table(frame, HISTORIES)
     with engine((), None) as connection:
         connection.register(HISTORIES, columns)
-        found = connection.table(HISTORIES)
-        types = zip(found.columns, map(str, found.types), strict=True)
+        relation = connection.table(HISTORIES)
+        types = zip(relation.columns, map(str, relation.types), strict=True)
         table = FrameTable((Path(HISTORIES),), tuple(types))
         mapping, reward = settle_mapping(connection, (table,), mapping, reward)
         tables = LogTables(connection, (table,), mapping, reward, session_by)

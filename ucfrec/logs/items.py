@@ -328,8 +328,8 @@ def write_grown_states(
         liking = np.clip((rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
         _, rows = np.unique(users, return_inverse=True)
         shape = (int(rows.max()) + 1, len(vectors))
-        shown = sparse.csr_matrix((EXPOSURE + liking, (rows, items)), shape=shape)
-        vectors = _fold_in(vectors, shown, old_counts, step_counts)
+        exposures = sparse.csr_matrix((EXPOSURE + liking, (rows, items)), shape=shape)
+        vectors = _fold_in(vectors, exposures, old_counts, step_counts)
     features = _extend_rows(old.user_features.numpy(), encoded.users, encoded.user_counts)
     write_item_table(
         folder / ITEM_STATES,
@@ -355,12 +355,12 @@ def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: 
 
 
 def _fold_in(
-    vectors: Float64Array, shown: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
+    vectors: Float64Array, exposures: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
 ) -> Float64Array:
     """Vectors (n, D) moved towards the mean of their users' vectors, that of the items (users, n)
     shown, weighted by liking; new steps of an item weigh as much as old ones."""
-    of_users = (shown @ vectors) / np.asarray(shown.sum(axis=1))
-    folded = shown.T @ (of_users - of_users.mean(axis=0))
+    of_users = (exposures @ vectors) / np.asarray(exposures.sum(axis=1))
+    folded = exposures.T @ (of_users - of_users.mean(axis=0))
     norms = np.linalg.norm(vectors[old_counts > 0], axis=1)
     lengths = np.linalg.norm(folded, axis=1, keepdims=True)
     folded *= (norms.mean() if len(norms) else 1.0) / np.where(lengths > 0, lengths, 1.0)

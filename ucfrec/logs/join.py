@@ -130,12 +130,14 @@ def join_feedback(
                 "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
             )
             _write(connection, columns, further, out)
-            ((shown, written, rows, matched, with_feedback),) = connection.sql(
+            ((exposure_rows, written, rows, matched, with_feedback),) = connection.sql(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
                 "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
             ).fetchall()
             unmatched = rows - matched
-            joined = Joined(shown, written - shown, with_feedback, matched, unmatched, columns)
+            joined = Joined(
+                exposure_rows, written - exposure_rows, with_feedback, matched, unmatched, columns
+            )
             if not joined.matched:
                 warn_user(_why_unmatched(connection, joined))
             return joined
@@ -331,9 +333,9 @@ def _write(
     for name, value in values.items():
         sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
         if earlier is not None and earlier.is_number:
-            before, is_count = f"coalesce({earlier.alias}, 0)", name == FEEDBACK
-            larger = f"greatest({sql}, CAST({before} AS DOUBLE))"
-            sql = f"{sql} + CAST({before} AS BIGINT)" if is_count else larger
+            earlier_value, is_count = f"coalesce({earlier.alias}, 0)", name == FEEDBACK
+            larger = f"greatest({sql}, CAST({earlier_value} AS DOUBLE))"
+            sql = f"{sql} + CAST({earlier_value} AS BIGINT)" if is_count else larger
         selects.append(f"{sql} AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
     ((whole,),) = connection.sql(

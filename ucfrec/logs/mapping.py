@@ -274,11 +274,11 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     files: dict[Path, None] = {}
     # A text is a sequence of texts, too: its characters.
     for path in [paths] if isinstance(paths, str) else paths:
-        named = Path(path)
-        if named.is_file() and not is_table(named):
+        file = Path(path)
+        if file.is_file() and not is_table(file):
             raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; {_CONVERT}")
-        if named.exists():
-            matches = _tables(named)
+        if file.exists():
+            matches = _tables(file)
         elif glob.has_magic(str(path)):
             globbed = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
             matches = [table for m in globbed if m.name[:1] != "." for table in _tables(m)]

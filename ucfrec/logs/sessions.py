@@ -202,11 +202,11 @@ class StepCounts:
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
         if len(self.values) <= FEW_VALUES:
-            others = rewards
+            uncounted = rewards
             for value in self.values:
-                self.values[value] += int(np.count_nonzero(others == value))
-                others = others[others != value]
-            values, counts = (part.tolist() for part in np.unique(others, return_counts=True))
+                self.values[value] += int(np.count_nonzero(uncounted == value))
+                uncounted = uncounted[uncounted != value]
+            values, counts = (part.tolist() for part in np.unique(uncounted, return_counts=True))
             self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
@@ -266,8 +266,8 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
     if has_items:
         codes = np.flatnonzero(counts.item_steps)
         columns = (codes, counts.item_steps[codes], counts.item_train_steps[codes])
-        used = pa.record_batch(list(map(to_arrow, columns)), ["code", "steps", "train_count"])
-        connection.register("used", used)
+        used_codes = pa.record_batch(list(map(to_arrow, columns)), ["code", "steps", "train_count"])
+        connection.register("used", used_codes)
         connection.execute(
             f"CREATE TABLE {USED_ITEMS} AS SELECT {schema.ITEM_ID}, code, steps, train_count "
             "FROM item_codes JOIN used USING (code)"

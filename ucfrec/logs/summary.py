@@ -140,8 +140,8 @@ def _measure_distributions(
     else:
         result["rewards"] = _bin_rewards(rows, cut, counts)
     if rows.log.key == schema.ITEM_ID:
-        shown = f"SELECT coalesce(steps, 0) FROM items LEFT JOIN {USED_ITEMS} USING (item_id)"
-        result["item_popularity"] = _bin_counts(connection, shown)
+        query = f"SELECT coalesce(steps, 0) FROM items LEFT JOIN {USED_ITEMS} USING (item_id)"
+        result["item_popularity"] = _bin_counts(connection, query)
     return result
 
 
@@ -200,8 +200,8 @@ def format_report(report: Mapping[str, Any]) -> str:
             lines.append((label, f"{n:,}{text}"))
 
     rule = DUPLICATES[report.get("duplicates", "highest")]
-    kept = f"  duplicates with a different reward from the kept row, which {rule}"
-    add("  conflicting duplicates", report["conflicting_duplicates"], kept)
+    conflicts = f"  duplicates with a different reward from the kept row, which {rule}"
+    add("  conflicting duplicates", report["conflicting_duplicates"], conflicts)
     add("  at equal times", report["equal_times"], " (in no order that could be learned)")
     add("  out of order", report["unsorted_rows"], " (sorted, none dropped)", always=True)
     add("steps kept", report["steps"], always=True)

@@ -106,10 +106,10 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
         added = [d for d in verdicts if d["distractor"]]
         true = [d for d in verdicts if not d["distractor"]]
         effects = [max(d["effect"], d["reward_effect"]) for d in true if d["effect"] is not None]
-        own: dict[str, Any] = {"task": row.task, "distractor": row.conditions["distractor"]}
-        own["training_seed"] = row.training_seed
-        own["flagged"] = all(d["flagged"] for d in added) if added else NONE
-        own |= {name: added[0][name] if added else NONE for name in ("effect", "reward_effect")}
-        own["true_flagged"] = [d["dimension"] for d in true if d["flagged"]]
-        lines.append({**own, "weakest_true": min(effects, default=NONE)})
+        columns: dict[str, Any] = {"task": row.task, "distractor": row.conditions["distractor"]}
+        columns["training_seed"] = row.training_seed
+        columns["flagged"] = all(d["flagged"] for d in added) if added else NONE
+        columns |= {name: added[0][name] if added else NONE for name in ("effect", "reward_effect")}
+        columns["true_flagged"] = [d["dimension"] for d in true if d["flagged"]]
+        lines.append({**columns, "weakest_true": min(effects, default=NONE)})
     return lines

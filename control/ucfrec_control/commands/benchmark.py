@@ -59,8 +59,8 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
         print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
         if lines := score_table(rows, checkpoint):
-            about = "mean ± standard error over seeds; bold: within 5% of the best"
-            print(f"\nscores of the {checkpoint} checkpoint, {about}")
+            legend = "mean ± standard error over seeds; bold: within 5% of the best"
+            print(f"\nscores of the {checkpoint} checkpoint, {legend}")
             print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")

@@ -210,8 +210,8 @@ def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
     for package in ("gymnasium", "mujoco", "gymnasium-robotics"):
         made_with = dataset["versions"].get(package)
         with suppress(PackageNotFoundError):
-            if made_with not in (None, here := version(package)):
+            if made_with not in (None, installed := version(package)):
                 warnings_.append(
-                    f"the data was made with {package} {made_with}, {here} is installed"
+                    f"the data was made with {package} {made_with}, {installed} is installed"
                 )
     return warnings_

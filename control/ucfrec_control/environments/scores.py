@@ -67,8 +67,8 @@ TASKS = (
 def find_task(name: str | None, other: str | None = None) -> Task | None:
     """The task of a name of an environment, file or dataset, else of another name; None if neither
     belongs to one."""
-    plain = [_plain(each or "") for each in (name, other)]
-    return next((task for each in plain for task in TASKS if task.pattern in each), None)
+    plain = [_plain(text or "") for text in (name, other)]
+    return next((task for text in plain for task in TASKS if task.pattern in text), None)
 
 
 def require_task(name: str | None, other: str | None = None) -> Task:

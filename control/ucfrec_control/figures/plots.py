@@ -46,10 +46,10 @@ def label(name: str) -> str:
 
 def colors(names: Iterable[str]) -> dict[str, str]:
     """Name to color: the fixed color of the name, else an unused color of the palette."""
-    listed = list(names)
-    taken = {_FIXED.get(name) for name in listed}
+    labels = list(names)
+    taken = {_FIXED.get(name) for name in labels}
     free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
-    return {name: _FIXED.get(name) or next(free) for name in listed}
+    return {name: _FIXED.get(name) or next(free) for name in labels}
 
 
 @file_style()
@@ -257,8 +257,8 @@ def training_curves(
     """
     figure, axes = _figure(COLUMN, 2.5, title, "training step", ylabel)
     for method, color in colors(curves).items():
-        first, *others = seeds = curves[method]
-        steps = sorted(step for step in first if all(step in seed for seed in others))
+        first, *later_seeds = seeds = curves[method]
+        steps = sorted(step for step in first if all(step in seed for seed in later_seeds))
         values = np.array([[seed[step] for step in steps] for seed in seeds])
         axes.plot(steps, values.mean(axis=0), color=color, label=label(method))
         low, high = values.min(axis=0), values.max(axis=0)

@@ -209,13 +209,13 @@ class _Predictors(nn.Module):
         return torch.cat(next_errors, 1), torch.cat(reward_errors, 1)
 
     def fit(
-        self, data: _Data, draw: Callable[[], Tensor], steps: int, rate: float, about: str
+        self, data: _Data, draw: Callable[[], Tensor], steps: int, rate: float, job: str
     ) -> None:
         """Update `steps` times; `draw` gives what is missing."""
         rows = torch.from_numpy(data.seen)
         optimizer = torch.optim.Adam(self.parameters(), lr=rate)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps)
-        with progress(steps, f"screening, {about}", "steps") as bar:
+        with progress(steps, f"screening, {job}", "steps") as bar:
             for _ in range(steps):
                 absent = draw()
                 batch = rows[torch.randint(len(rows), (data.config.batch_size,))]
@@ -304,8 +304,8 @@ def _fit_own(shared: _Predictors, data: _Data, missing: Sequence[Collection[int]
     with torch.no_grad():
         for copy, original in zip(pair.parameters(), shared.parameters(), strict=True):
             copy.copy_(original.expand_as(copy))
-    rate, about = config.learning_rate / 3, f"{len(missing)} cases"
-    pair.fit(data, lambda: absences, config.own_steps, rate, about)
+    rate, job = config.learning_rate / 3, f"{len(missing)} cases"
+    pair.fit(data, lambda: absences, config.own_steps, rate, job)
     rng, count = np.random.default_rng(data.seed), min(len(data.seen), 4 * _CHUNK)
     sample = np.sort(rng.choice(data.seen, count, replace=False))
     fitted = pair.all_errors(data, sample, absences)[0].mean(1)

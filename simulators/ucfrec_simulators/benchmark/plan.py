@@ -115,9 +115,9 @@ class RecommendationCells:
             plant_distractor(EpisodeStore.open(task.store), planted)
         name, folder = environment.name, environment.folder
         clean = replace(task, environments=(environment,))
-        shown = tuple(DistractorEnvironment(name, folder, rate) for rate in (OFF, ON))
+        environments = tuple(DistractorEnvironment(name, folder, rate) for rate in (OFF, ON))
         title = f"{task.name}, distractor"
-        both = (clean, replace(task, name=title, store=planted, environments=shown))
+        both = (clean, replace(task, name=title, store=planted, environments=environments))
         # Cells that share a run lie far apart, so that no process waits for another's.
         for quantile, variant in product(DISTRACTOR_TARGETS, both):
             evaluation = replace(self._budget.evaluation, target_quantile=quantile)
@@ -155,5 +155,11 @@ def _available(name: str) -> bool:
 def _settings(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
     """Settings of a training over the defaults."""
     memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
-    own = budget.of_policies.get(method.policy, ())
-    return (*budget.settings, *memory, *own, *method.settings, *budget.of_methods.get(name, ()))
+    settings = budget.of_policies.get(method.policy, ())
+    return (
+        *budget.settings,
+        *memory,
+        *settings,
+        *method.settings,
+        *budget.of_methods.get(name, ()),
+    )

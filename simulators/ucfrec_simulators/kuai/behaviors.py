@@ -89,9 +89,9 @@ def simulators(
         Regimes FB, NX_0 and NX_10 with `own_exit`, then FB and NX_0 with DORL's exit rules of four
         items and of one item.
     """
-    four, one = EXITS["dorl-main-explore"], EXITS["dorl-main"]
+    four, single = EXITS["dorl-main-explore"], EXITS["dorl-main"]
     variants = [("FB", own_exit), ("NX_0", own_exit), ("NX_10", own_exit)]
-    variants += [("FB", four), ("NX_0", four), ("FB", one), ("NX_0", one)]
+    variants += [("FB", four), ("NX_0", four), ("FB", single), ("NX_0", single)]
     return tuple(
         Simulator(
             summary=f"{summary}; {_describe(regime, exit_rule)}",

@@ -238,9 +238,11 @@ def snapshots(env: AnyEnv, seed: int, config: DdpgConfig) -> list[nn.Module]:
     tensors, _ = load_tensors(file)
     networks: list[nn.Module] = []
     for index in range(config.snapshots):
-        own = {k.partition(".")[2]: v for k, v in tensors.items() if k.startswith(f"{index}.")}
+        parameters = {
+            k.partition(".")[2]: v for k, v in tensors.items() if k.startswith(f"{index}.")
+        }
         networks.append(_network(_high(env).size, config.hidden))
-        load_weights(file, networks[-1], own)
+        load_weights(file, networks[-1], parameters)
     return networks
 
 

@@ -1,6 +1,6 @@
 """Estimates from logs the return of a trained policy, and reports how reliable that is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
@@ -43,7 +43,7 @@ from ucfrec.off_policy.verdict import (
     list_cautions,
 )
 from ucfrec.provenance import config_hash, provenance, shorten_paths
-from ucfrec.results.rows import ResultRow, ResultTable, Scalar
+from ucfrec.results.rows import ResultRow, ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 
@@ -245,10 +245,6 @@ def evaluate_off_policy(
     return make_report(trained, rule, evidence, seed, options)
 
 
-_TABLES = {"R_cum": ("estimates", "sessions"), "R_step": ("per step", "steps")}
-"""Table of each metric's rows, and what is counted there."""
-
-
 def make_report(
     trained: TrainedPolicy,
     rule: DecisionRule,
@@ -272,58 +268,42 @@ def make_report(
         filter_seen=options.filter_seen,
     )
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
-    record, choice = trained.record, "softmax" if rule.draws else "greedy"
-    conditions: dict[str, Scalar] = {
-        "run": shorten_paths(str(trained.folder)),
-        "discount": options.discount,
-        "pages": options.pages,
-        "anonymous": not options.users_known,
-        "filter_seen": options.filter_seen,
-        "sessions": len(steps.first),
-        "steps": evidence.rows,
-    }
     judged = evidence.columns | asdict(verdict) | diagnosis.as_columns()
     judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
     del judged["estimator"], judged["reasons"]
-
-    by_metric = {"R_cum": estimates, "R_step": {} if per_step is None else per_step.estimates}
-
-    def make_row(metric: str, name: str) -> ResultRow:
-        result = by_metric[metric][name]
-        table, units = _TABLES[metric]
-        row = ResultRow(
-            suite=SUITE,
-            table=table,
-            task="logs",
-            method=name,
-            policy="behavior" if name == LOGGED else trained.name,
-            training_seed=record.seed,
-            evaluation_seed=seed,
-            conditions={**conditions, "choice": "as logged" if name == LOGGED else choice},
-            config_hash=config_hash(record.settings),
-            data_fingerprint=evidence.fingerprint,
-            metric=metric,
-            metrics={metric: result.value},
-            interval=result.interval,
-            target_return=rule.target,
-            rule=rule.hash,
-            **provenance(),
-        )
-        numbers = {
-            f"{metric}_error": result.error,
-            f"effective_{units}": result.effective_sessions,
-            "largest_weight": result.largest_weight,
-            "parameter": result.parameter,
-            "decision_rule": rule.as_dict(),
-        }
-        return row.extended({**numbers, **judged})
-
+    record, of_steps = trained.record, {} if per_step is None else per_step.estimates
+    base = ResultRow(
+        suite=SUITE,
+        table="estimates",
+        task="logs",
+        method=LOGGED,
+        policy=trained.name,
+        training_seed=record.seed,
+        evaluation_seed=seed,
+        conditions={
+            "run": shorten_paths(str(trained.folder)),
+            "discount": options.discount,
+            "pages": options.pages,
+            "anonymous": not options.users_known,
+            "filter_seen": options.filter_seen,
+            "sessions": len(steps.first),
+            "steps": evidence.rows,
+            "choice": "softmax" if rule.draws else "greedy",
+        },
+        config_hash=config_hash(record.settings),
+        data_fingerprint=evidence.fingerprint,
+        metric="R_cum",
+        metrics={},
+        target_return=rule.target,
+        rule=rule.hash,
+        **provenance(),
+    )
     weighable = None if steps.lacking.all() else steps.weighable
     terms = None
     if weighable is not None and verdict.estimator is not None:
         terms = session_terms(weighable)[verdict.estimator].influences
     return OffPolicyReport(
-        rows=[make_row("R_cum", name) for name in estimates],
+        rows=_make_rows(base, estimates, rule, judged),
         warnings=warnings,
         verdict=verdict,
         models=evidence.models,
@@ -331,8 +311,32 @@ def make_report(
         user=None if weighable is None else weighable.user,
         terms=terms,
         per_step=per_step,
-        step_rows=[make_row("R_step", name) for name in by_metric["R_step"]],
+        step_rows=_make_rows(
+            replace(base, table="per step", metric="R_step"), of_steps, rule, judged
+        ),
     )
+
+
+def _make_rows(
+    base: ResultRow, estimates: Mapping[str, Estimate], rule: DecisionRule, judged: dict[str, Any]
+) -> list[ResultRow]:
+    """A row like `base` for each estimate."""
+    rows, units = [], "sessions" if base.metric == "R_cum" else "steps"
+    for name, result in estimates.items():
+        row = replace(base, method=name, interval=result.interval)
+        if name == LOGGED:
+            logged = {**base.conditions, "choice": "as logged"}
+            row = replace(row, policy="behavior", conditions=logged)
+        numbers = {
+            base.metric: result.value,
+            f"{base.metric}_error": result.error,
+            f"effective_{units}": result.effective_sessions,
+            "largest_weight": result.largest_weight,
+            "parameter": result.parameter,
+            "decision_rule": rule.as_dict(),
+        }
+        rows.append(row.extended({**numbers, **judged}))
+    return rows
 
 
 def _doubt_logs(evidence: Evidence, logged: LoggedSessions, pages: bool) -> None:

@@ -216,8 +216,8 @@ def test_unusable_features_are_refused(env: gymnasium.Env[Any, Any], tmp_path: P
     refused("absent", "absent is neither a .npy or .parquet file nor an attribute")
     refused("vectors.absent", "neither a .npy or .parquet file nor an attribute")
     refused("played", r"an array of float64 of shape \(0,\); give numbers with one row for each")
-    refused(tmp_path / "absent.npy", "cannot be read")
-    refused(tmp_path / "absent.parquet", "cannot be read")
+    refused(tmp_path / "absent.npy", "does not exist")
+    refused(tmp_path / "absent.parquet", "does not exist")
     path = tmp_path / "x.npy"
     np.save(path, np.array([{}, 1, 2, 3], dtype=object))
     refused(path, "cannot be read")

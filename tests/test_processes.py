@@ -74,15 +74,12 @@ def test_a_terminal_without_unicode_gets_replacement_characters(
 def ended(process: int, seconds: float = 20) -> bool:
     """Whether a process ends in time; one that no process has waited for yet counts as ended."""
     until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        try:
-            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
+    with suppress(OSError):
+        while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.05)
+    return True
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -302,11 +299,9 @@ def test_a_terminal_shows_a_bar() -> None:
     with subprocess.Popen([sys.executable, "-c", code], stderr=theirs) as process:
         os.close(theirs)
         shown = b""
-        try:
+        with suppress(OSError):  # the other end is closed
             while chunk := os.read(ours, 4096):
                 shown += chunk
-        except OSError:  # the other end is closed
-            pass
         assert process.wait() == 0
     os.close(ours)
     assert b"train: 100%" in shown

@@ -36,9 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def record_of(folder: Path) -> dict[str, Any]:
-    record: dict[str, Any] = read_json(folder / "run" / "run.json")
-    return record
+def record_of(folder: Path) -> Any:
+    return read_json(folder / "run" / "run.json")
 
 
 def test_what_is_written_comes_back(folder: Path, tmp_path: Path) -> None:

@@ -172,19 +172,6 @@ def test_only_the_latest_session_makes_the_state_but_all_is_seen(
     assert not set(filtered.item_id) & {*earlier.item_id, *recent.item_id}
 
 
-def test_the_command_equals_the_python_api(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
-) -> None:
-    policy, folder = fitted
-    repeated = pd.concat([log.assign(reward=0.0), log])  # of two rewards, the higher counts
-    repeated.to_parquet(tmp_path / "log.parquet")
-    arguments = [str(folder / "run"), str(tmp_path / "log.parquet"), "--k", "7", "--keep-seen"]
-    assert main(["recommend", *arguments, "--out", str(tmp_path / "out.parquet")]) == 0
-    written = pd.read_parquet(tmp_path / "out.parquet")
-    pd.testing.assert_frame_equal(written, policy.recommend(log, k=7, filter_seen=False))
-    pd.testing.assert_frame_equal(written, policy.recommend(repeated, k=7, filter_seen=False))
-
-
 def test_only_candidates_are_recommended(
     fitted: tuple[Recommender, Path], log: pd.DataFrame
 ) -> None:
@@ -322,23 +309,6 @@ def test_times_mean_the_same_here_and_in_prepare(
     assert set(read[0][1]) == set(whole.timestamp)
 
 
-def test_seconds_need_a_mapping_here_and_in_prepare(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
-) -> None:
-    policy, _ = fitted
-    seconds = log.assign(timestamp=log.timestamp / 1000)
-    seconds.to_parquet(tmp_path / "log.parquet")
-    with pytest.raises(InputError, match="is the time in milliseconds"):
-        policy.recommend(seconds)
-    with pytest.raises(InputError, match="is the time in milliseconds"):
-        prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store")
-    mapping = LogMapping({"timestamp": "timestamp * 1000"})
-    pd.testing.assert_frame_equal(policy.recommend(seconds, mapping=mapping), policy.recommend(log))
-    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store")
-    store = EpisodeStore.open(tmp_path / "store")
-    assert set(store.step_values("timestamp", *store.all_steps())) == set(log.timestamp)
-
-
 WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
@@ -383,19 +353,9 @@ LEFT_OUT: dict[str, tuple[object, str]] = {
         lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
         r"\(3: user, item or action, time or session is missing",
     ),
-    "null times": (
-        lambda log: log.assign(
-            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
-        ),
-        r"\(2: user, item or action, time or session is missing",
-    ),
     "a clock of 1970": (
         lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
         r"\(4: time before 2000.*is the time in milliseconds",
-    ),
-    "no number": (
-        lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
-        r"\(5: reward is missing, NaN or infinite",
     ),
     "infinite": (
         lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),

@@ -87,11 +87,6 @@ HOSTILE: dict[str, Any] = {
 }
 
 
-def test_an_unknown_field_is_named_with_the_class() -> None:
-    with pytest.raises(InputError, match=r"^DecisionRule has no field 'temp'; "):
-        DecisionRule(1.0, temp=1)  # type: ignore[call-arg]
-
-
 @pytest.mark.parametrize("case", HOSTILE)
 def test_hostile_values_are_refused_in_one_line(case: str) -> None:
     with pytest.raises(InputError, match=r"^run/rule\.json") as caught:

@@ -43,7 +43,7 @@ from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
+from ucfrec.user_model.reward import LAGS, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 SETTINGS = {
@@ -280,18 +280,6 @@ def last_sessions(log: pd.DataFrame) -> Iterator[tuple[Any, list[int], list[floa
             yield user, latest.item_id.tolist(), latest.reward.tolist()
 
 
-def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    for rule in (DecisionRule(3.0, tag_run=10), DecisionRule(3.0, tag_window=10)):
-        scorer = replace(trained, reward_model=None).scorer(rule)
-        assert scorer.policy.config.context < 10
-        logged = EpisodeStore.open(folder / "store")
-        at = logged, np.array([0]), logged.lengths[:1] - 1
-        assert sessions_before(scorer, *at).shown.items.shape == (1, 10)
-        assert sessions_before(trained.scorer(rule), *at).shown.items.shape == (1, MEMORY)
-
-
 @pytest.mark.parametrize(
     ("trained", "rule"),
     [
@@ -361,46 +349,3 @@ def test_items_of_a_session_count_as_seen_from_the_next_step(folder: Path) -> No
     scorer = trained.scorer(replace(trained.rule, exclude_seen=True))
     left_out = np.isneginf(logged_scores(scorer, store, episodes, steps).numpy())
     np.testing.assert_array_equal(left_out, seen.numpy())
-
-
-def test_rewards_of_the_session_lower_the_target_of_recommendations(trained: TrainedPolicy) -> None:
-    """A session with rewards of r so far with target T is recommended as one that has not, with T
-    − r."""
-    log = tagged_log()
-    user, items, _ = max(last_sessions(log), key=lambda session: len(session[1]))
-    window = trained.policy.config.context
-    assert len(items) > window + trained.record.return_to_go.horizon
-    rows = log[log.user_id == user].tail(len(items))
-
-    def scores(rewards: float, target: float) -> pd.Series:
-        # Rewards change the state too, so only one before the policy's memory is changed.
-        first = np.arange(len(rows)) == 0
-        given = rows.assign(reward=np.where(first, rewards, 0.0))
-        histories = histories_of_frame(trained, given, LogMapping())
-        rule = DecisionRule(target)
-        (frame,) = recommend(trained, histories, MANY, rule=rule, filter_seen=False)
-        return frame.sort_values("item_id").score.reset_index(drop=True)
-
-    # Liking is clipped: any reward of 1 or more makes the same states.
-    low, high, same = scores(1.0, 4.0), scores(3.0, 4.0), scores(3.0, 6.0)
-    if trained.record.return_to_go.per_session:
-        np.testing.assert_allclose(low, same, atol=1e-5)
-        assert not np.allclose(low, high, atol=1e-6)
-    else:
-        np.testing.assert_allclose(low, high, atol=1e-5)
-
-
-def test_a_user_who_has_seen_all_candidates_gets_no_row(folder: Path) -> None:
-    trained, log = TrainedPolicy.load(folder / "session"), tagged_log()
-    (user, items, _), (other, *_) = list(last_sessions(log))[:2]
-    log = log[log.user_id.isin([user, other])]
-    rule = replace(trained.rule, exclude_seen=True)
-    (frame,) = recommend(
-        trained,
-        histories_of_frame(trained, log, LogMapping()),
-        3,
-        rule=rule,
-        filter_seen=False,
-        candidates=items[:1],
-    )
-    assert user not in set(frame.user_id)

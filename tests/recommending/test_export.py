@@ -246,7 +246,8 @@ def test_what_scores_items_in_its_own_way_is_refused(tmp_path: Path, name: str) 
     with pytest.raises(InputError, match=rf"'{name}.*cannot be exported; train"):
         export(trained, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    assert isinstance(Recommender.load(trained.folder), Recommender)
+    with pytest.raises(InputError, match=rf"{name}.*use --engine torch"):
+        responder(trained, engine=ONNXRUNTIME)
 
 
 @pytest.mark.parametrize("n", [1000, 2 * _CHUNK + 17])
@@ -299,11 +300,6 @@ def test_answers_are_those_of_torch(
     assert len(alone) == len(asked)
 
 
-@pytest.mark.slow
-def test_the_run_s_own_scorer_stays_as_it_is(ending: TrainedPolicy, fast: Responder) -> None:
-    assert ending.scorer(fast.rule)._engine is None
-
-
 def test_graphs_differ_by_the_rounding_of_what_is_added(ending: TrainedPolicy) -> None:
     rule = replace(ending.rule, reward_weight=32.0, lookahead=4.8)
     assert measure_magnitude(ending.scorer(rule)) == pytest.approx(32 * 5.8)
@@ -313,12 +309,3 @@ def test_graphs_differ_by_the_rounding_of_what_is_added(ending: TrainedPolicy) -
     assert require_close([(theirs, ours)], "", 185.6) < 1e-6
     with pytest.raises(InputError, match="differs from torch's"):
         require_close([(theirs, ours)], "", 1.0)
-
-
-def test_engines_that_are_unknown_or_cannot_score_are_refused(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match=r"item-knn.*use --engine torch"):
-        responder(trained_run(tmp_path, "item-knn"), engine=ONNXRUNTIME)
-    with pytest.raises(InputError, match="give one of torch, onnxruntime"):
-        responder(trained, engine="gpu")

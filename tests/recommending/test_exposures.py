@@ -40,17 +40,6 @@ def read(folder: Path) -> list[tuple[object, ...]]:
     return list(frame.drop(columns=["timestamp", "arm"]).itertuples(index=False, name=None))
 
 
-def test_what_waits_is_written_when_the_log_is_closed(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    given = answers(trained)
-    with closing(ExposureLog(tmp_path / "shown", trained)) as log:
-        for user, answer in given.items():
-            log.add(user, answer)
-        assert not list((tmp_path / "shown").iterdir())
-    assert read(tmp_path / "shown") == rows_of(given)
-
-
 def test_files_rotate_by_size_and_by_time(trained: TrainedPolicy, tmp_path: Path) -> None:
     given = answers(trained)
 

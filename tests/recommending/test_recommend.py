@@ -339,19 +339,9 @@ LEFT_OUT: dict[str, tuple[object, str]] = {
         lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
         r"\(3: user, item or action, time or session is missing",
     ),
-    "null times": (
-        lambda log: log.assign(
-            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
-        ),
-        r"\(2: user, item or action, time or session is missing",
-    ),
     "a clock of 1970": (
         lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
         r"\(4: time before 2000.*is the time in milliseconds",
-    ),
-    "no number": (
-        lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
-        r"\(5: reward is missing, NaN or infinite",
     ),
     "infinite": (
         lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),

@@ -56,13 +56,6 @@ def test_times_are_milliseconds_or_iso_text(
     assert request.history[0]["timestamp"] == expected
 
 
-@pytest.mark.parametrize("given", ["soon", "01/05/2024", "2024-13-01", "", "9" * 65])
-def test_other_text_is_no_time(given: str) -> None:
-    rows = [{"item_id": 1, "timestamp": given}]
-    with pytest.raises(InputError, match=r"history.0.timestamp"):
-        parse(Request, json.dumps({"user_id": 1, "history": rows}).encode(), Limits())
-
-
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
@@ -92,6 +85,10 @@ def test_other_text_is_no_time(given: str) -> None:
             "history.0.reward: .*, not null$",
         ),
         ('"user_id": 1, "history": [{"item_id": 1, "timestamp": true}]', "history.0.timestamp: "),
+        (
+            f'"user_id": 1, "history": [{{"item_id": 1, "timestamp": "{"9" * 65}"}}]',
+            "history.0.timestamp: ",
+        ),
         (
             '"user_id": 1, "history": [{"item_id": 1, "timestamp": "soon"}]',
             'history.0.timestamp: .*an ISO 8601 time such as .*, not "soon"$',

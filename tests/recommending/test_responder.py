@@ -24,7 +24,6 @@ from tests.support.served import (
     trained_run,
     with_rule,
 )
-from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import Expression
@@ -87,6 +86,8 @@ def test_requests_give_the_observations_that_logs_have(screened: TrainedPolicy) 
 
 
 def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> None:
+    with pytest.raises(InputError, match="k is 0; give a whole number from 1 to 1,000"):
+        responder(trained, k=0)
     log = histories(users=4)
     requests = requests_of(log)
     asked = [
@@ -140,13 +141,6 @@ def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: Tra
     (again,) = by.answers([Request(user_id=7, request_id=made.request_id)])
     assert isinstance(again, Answer)
     assert again.items == made.items
-
-
-def test_a_user_without_a_history_is_answered(trained: TrainedPolicy) -> None:
-    found = answered(responder(trained, k=4), [{"user_id": "nobody"}, {"user_id": 10**9}])
-    one, other = (found[found.user_id == user] for user in ("nobody", 10**9))
-    assert one.item_id.tolist() == other.item_id.tolist()
-    assert len(one) == 4
 
 
 def test_a_user_who_has_seen_everything_gets_nothing(trained: TrainedPolicy) -> None:
@@ -245,22 +239,6 @@ def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> Non
     assert seen.tolist() == [1.0, -2.5]
     with pytest.raises(InputError, match="numbers beyond"):
         reader.read([Row(**{**row, "observation": [1, -1e39]})], 1)  # type: ignore[typeddict-item]
-
-
-def test_nothing_of_a_request_is_kept(trained: TrainedPolicy) -> None:
-    by, requests = responder(trained), requests_of(histories(users=2))
-    request = {"user_id": 100, "request_id": "a"}
-    before = answered(by, [request])
-    answered(by, requests)
-    pd.testing.assert_frame_equal(answered(by, [request]), before)
-
-
-def test_a_policy_of_vectors_and_a_wrong_k_are_refused(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match="k is 0; give a whole number from 1 to 1,000"):
-        responder(trained, k=0)
-    assert repr(Recommender.load(trained.folder))
 
 
 # Runs that share the users, and a run that is replaced as the server runs.
@@ -422,11 +400,6 @@ def test_a_run_that_is_made_again_under_its_name_replaces_the_one_that_answers(
             shutil.rmtree(folder / "run")
             (folder / "kept").rename(folder / "run")
             promote(folder / "run", force=True)
-
-
-def test_a_folder_without_a_promoted_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no run in it was promoted"):
-        Served(make, tmp_path, None)
 
 
 def test_unknown_items_and_users_are_counted(folder: Path) -> None:

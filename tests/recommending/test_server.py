@@ -43,24 +43,6 @@ def served(run: Path, *options: str) -> Iterator[tuple["subprocess.Popen[str]", 
             process.kill()
 
 
-def test_it_follows_the_promoted_run_and_answers_all_the_while(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    for name in ("monday", "tuesday"):
-        shutil.copytree(trained.folder, tmp_path / name)
-    assert main(["promote", str(tmp_path / "monday")]) == 0
-    with served(tmp_path) as (_, address):
-        assert httpx.get(f"{address}/health").json()["name"] == "monday"
-        assert main(["promote", str(tmp_path / "tuesday"), "--force"]) == 0
-        deadline = time.monotonic() + 60
-        while httpx.get(f"{address}/health").json()["name"] != "tuesday":
-            answer = httpx.post(f"{address}/recommendations", json={"user_id": 1, "k": 2})
-            assert answer.status_code == 200
-            assert time.monotonic() < deadline
-        metrics = httpx.get(f"{address}/metrics").text
-        assert 'ucfrec_drift{measure="unknown_users"}' in metrics
-
-
 def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:
@@ -75,7 +57,8 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
         ]
         assert not list(folder.iterdir())
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
+        _, errors = process.communicate(timeout=60)
+        assert (process.returncode, errors) == (0, "ucfrec serve: stopped\n")
     assert {answer["arm"] for answer in answers} == {"a", "b"}
     shown = pd.concat(map(pd.read_parquet, folder.iterdir()))
     names = ["user_id", "arm", "request_id", "position", "item_id", "propensity"]
@@ -87,29 +70,6 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
         )
     ]
     assert sorted(shown[names].itertuples(index=False, name=None)) == sorted(expected)
-
-
-def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> None:
-    with served(trained.folder) as (process, address):
-        host, port = address.removeprefix("http://").split(":")
-        with socket.create_connection((host, int(port)), timeout=60) as slow:
-            body = b'{"user_id": 1, "k": 3}'
-            head = f"POST /recommendations HTTP/1.1\r\nHost: {host}\r\n"
-            head += f"Content-Length: {len(body)}\r\n\r\n"
-            slow.sendall(head.encode() + body[:5])
-            assert httpx.get(f"{address}/health").status_code == 200
-            process.send_signal(signal.SIGTERM)
-            time.sleep(0.5)
-            slow.sendall(body[5:])
-            answer = b""
-            while block := slow.recv(65536):
-                answer += block
-        assert answer.startswith(b"HTTP/1.1 200 OK")
-        assert b'"items"' in answer
-        _, errors = process.communicate(timeout=60)
-        assert (process.returncode, errors) == (0, "ucfrec serve: stopped\n")
-        with pytest.raises(httpx.TransportError):
-            httpx.get(f"{address}/health")
 
 
 def answers_of(address: str, *parts: bytes) -> bytes:

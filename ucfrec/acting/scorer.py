@@ -46,7 +46,7 @@ class Part(NamedTuple):
 
     def at(self, rows: slice) -> "Part":
         """The sessions with the given numbers."""
-        return Part(self.factors[rows], self.repeated[rows], self.alike[rows])
+        return Part._make(values[rows] for values in self)
 
 
 class Query(NamedTuple):
@@ -68,14 +68,9 @@ class Query(NamedTuple):
 
     def at(self, rows: slice) -> "Query":
         """The sessions with the given numbers."""
-        return Query(
-            self.sessions.at(rows),
-            self.states[rows],
-            self.items[rows],
-            None if self.policy is None else self.policy.at(rows),
-            None if self.outputs is None else self.outputs[rows],
-            None if self.features is None else self.features[rows],
-            None if self.model is None else self.model.at(rows),
+        return Query._make(
+            value if value is None else value[rows] if isinstance(value, Tensor) else value.at(rows)
+            for value in self
         )
 
 

@@ -110,23 +110,28 @@ def export(
         runner = _start_runner(path)
         for sessions in (_COMPARED, 1):
             arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
-            scores, _, top_scores = _run_graph(runner, arguments)
+            found = _run_graph(runner, arguments)
             with torch.no_grad():
-                expected, _, top_expected = graph(*arguments.values())
-            pairs = ((scores, expected), (top_scores, top_expected))
+                expected = graph(**arguments)
+            pairs = zip(found[::2], expected[::2], strict=True)  # scores, without numbers of items
             size = measure_magnitude(graph.scorer)
             difference = max(difference, require_close(pairs, _SERVE, size))
         sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
-        description = _describe_graph(graph, trained) | {"files": list(sizes)}
-        write_json(scratch / DESCRIPTION, description)
+        outputs = dict(zip(OUTPUTS, expected, strict=True))
+        description = _describe_graph(graph.scorer, trained, arguments, outputs)
+        write_json(scratch / DESCRIPTION, description | {"files": list(sizes)})
     return Exported(sum(sizes.values()), difference)
 
 
 class _Network(nn.Module):
-    """A scorer as a module, with its weights."""
+    """A scorer as a module, with its weights; InputError if the policy has no vectors of items."""
 
-    def __init__(self, scorer: Scorer) -> None:
+    def __init__(self, scorer: Scorer, kind: str, remedy: str) -> None:
         super().__init__()
+        if not scorer.has_factors:
+            raise InputError(
+                f"policies of kind {kind!r} score items in a way of their own, which {remedy}"
+            )
         models = (scorer.policy, scorer.reward_model)
         self.scorer = scorer
         self._models = nn.ModuleList(model for model in models if model is not None)
@@ -141,28 +146,22 @@ class RuleGraph(_Network):
     """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
 
     def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
-        """
-        Raises:
-            InputError: the policy has vector actions, or scores items in a way of its own.
-        """
         if scorer.states is None:
             raise InputError(
                 "this policy's actions are vectors; only policies of items can be exported"
             )
-        if not scorer.has_factors:
+        super().__init__(
+            scorer,
+            kind,
+            "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc",
+        )
+        self._items = len(scorer.states.embeddings)
+        self._k, most = min(_DEFAULT_K, self._items) if k is None else k, min(self._items, _CHUNK)
+        if not 1 <= self._k <= most:
             raise InputError(
-                f"policies of kind {kind!r} score items in a way of their own, which "
-                "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc"
+                f"--k is {k}; the run has {self._items:,} items: give a whole number from 1 to "
+                f"{most:,}"
             )
-        items = len(scorer.states.embeddings)
-        most = min(items, _CHUNK)
-        k = min(_DEFAULT_K, items) if k is None else k
-        if not 1 <= k <= most:
-            raise InputError(
-                f"--k is {k}; the run has {items:,} items: give a whole number from 1 to {most:,}"
-            )
-        super().__init__(scorer)
-        self.k, self._items = k, items
 
     def forward(  # type: ignore[override]
         self,
@@ -183,7 +182,7 @@ class RuleGraph(_Network):
         left_out = nothing.scatter(1, places, torch.ones_like(places, dtype=torch.bool))[:, :-1]
         sessions = Sessions(items, rewards, steps, collected, users, observations)
         scores = self.scorer.scores(sessions, excluded=left_out, empty=True)
-        return scores, *find_best(scores, self.k)
+        return scores, *find_best(scores, self._k)
 
 
 def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -218,11 +217,7 @@ class ScoreGraph:
 
     def __init__(self, scorer: Scorer, kind: str) -> None:
         _require_installed()
-        if not scorer.has_factors:
-            raise InputError(
-                f"policies of kind {kind!r} score items in a way of their own, which onnxruntime "
-                f"cannot compute; {_TORCH}"
-            )
+        network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
         assert scorer.states is not None
         items = len(scorer.states.embeddings)
 
@@ -236,7 +231,7 @@ class ScoreGraph:
         example = {**_name_inputs(session), _EXCLUDED: excluded}
         names = list(example), ["scores"]
         with tempfile.TemporaryDirectory() as folder:
-            path, network = Path(folder) / GRAPH, _Network(scorer).eval()
+            path = Path(folder) / GRAPH
             _write_graph(network, tuple(example.values()), path, names, kind, _TORCH)
             self._runner = _start_runner(path, threads=1)
         size = measure_magnitude(scorer)
@@ -408,30 +403,25 @@ def _quiet() -> Any:
         logging.disable(level)
 
 
-def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
+def _describe_graph(
+    scorer: Scorer,
+    trained: TrainedPolicy,
+    inputs: dict[str, Tensor],
+    outputs: dict[str, Tensor],
+) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    rule, record, b = graph.scorer.rule, trained.record, "batch"
-    length, context = graph.scorer.length, graph.scorer.policy.config.context
-    dropped = record.dropped_observations
-    inputs: dict[str, tuple[str, list[str | int]]] = {
-        "items": ("int64", [b, length]),
-        "rewards": ("float32", [b, length]),
-        "steps": ("int64", [b]),
-        "collected": ("float64", [b]),
-        "users": ("int64", [b]),
-        _EXCLUDED: ("int64", [b, "excluded_items"]),
-    }
-    if record.observation_size:
-        inputs[_OBSERVATIONS] = ("float32", [b, context, record.observation_size])
-    outputs: dict[str, tuple[str, list[str | int]]] = {
-        "scores": ("float32", [b, len(trained.items)]),
-        "top_items": ("int64", [b, graph.k]),
-        "top_scores": ("float32", [b, graph.k]),
-    }
+    rule, record, dropped = scorer.rule, trained.record, trained.record.dropped_observations
     described_inputs, described_outputs = (
         [
-            {"name": name, "dtype": dtype, "shape": shape, "meaning": _MEANINGS[name]}
-            for name, (dtype, shape) in tensors.items()
+            {
+                "name": name,
+                "dtype": str(tensor.dtype).removeprefix("torch."),
+                "shape": ["batch", "excluded_items"]
+                if name == _EXCLUDED
+                else ["batch", *tensor.shape[1:]],
+                "meaning": _MEANINGS[name],
+            }
+            for name, tensor in tensors.items()
         ]
         for tensors in (inputs, outputs)
     )

@@ -151,23 +151,15 @@ class ExposureLog:
             time.sleep(min(1.0, self._seconds))
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
-        columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
-        for user_id, now, answer in waiting:
-            size = len(answer.items)
-            values: dict[str, Iterable[object]] = {
-                schema.USER_ID: [user_id] * size,
-                schema.ITEM_ID: answer.items,
-                schema.TIMESTAMP: [now] * size,
-                schema.REQUEST_ID: [answer.request_id] * size,
-                schema.POSITION: range(1, size + 1),
-                schema.PROPENSITY: answer.propensities,
-                schema.RUN: [answer.run] * size,
-                schema.RULE: [answer.rule] * size,
-                schema.ARM: [answer.arm] * size,
-            }
-            for name, column in columns.items():
-                column += values[name]
-        return pa.table(columns, self._schema)
+        rows = [
+            (user, item, now, each.request_id, position, chance, each.run, each.rule, each.arm)
+            for user, now, each in waiting
+            for position, (item, chance) in enumerate(
+                zip(each.items, each.propensities, strict=True), 1
+            )
+        ]
+        frame = pd.DataFrame(rows, columns=self._schema.names)
+        return pa.Table.from_pandas(frame, self._schema, preserve_index=False)
 
 
 def _warn(message: str) -> None:

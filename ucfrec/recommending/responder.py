@@ -25,7 +25,6 @@ TORCH: Final = "torch"
 ONNXRUNTIME: Final = "onnxruntime"
 _LARGEST_EXACT: Final = 2**53 - 1
 """Largest integer that JavaScript holds exactly."""
-ENGINES: Final = (TORCH, ONNXRUNTIME)
 SECONDS: Final = 2.0
 """Time between two looks at which run is current."""
 _UNITS: Final = 2**32
@@ -118,7 +117,8 @@ class Responder:
 
         Args:
             k: items for requests that do not say how many.
-            engine: what computes the scores of a request that comes alone, one of `ENGINES`.
+            engine: what computes the scores of a request that comes alone, "torch" or
+                "onnxruntime".
 
         Raises:
             InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
@@ -127,8 +127,6 @@ class Responder:
         scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
-        if engine not in ENGINES:
-            raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
         if engine == ONNXRUNTIME:
             from ucfrec.recommending.export import ScoreGraph
 

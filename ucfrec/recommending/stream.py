@@ -136,13 +136,7 @@ class _Remembered:
         rows = [*earlier, *request.interactions]
         if len(rows) > self._limits.history:
             rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
-        return Request(
-            user_id=request.user_id,
-            k=request.k,
-            candidates=request.candidates,
-            new_session=request.new_session,
-            request_id=request.request_id,
-        ).model_copy(update={"history": rows})
+        return request.model_copy(update={"history": rows})
 
     def keep(self, request: StreamRequest, rows: list[Row]) -> None:
         """Remember all rows of a user, if there are any."""

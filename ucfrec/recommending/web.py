@@ -191,8 +191,7 @@ class _Metrics:
             self._cpu.inc(self._used - seconds)
 
 
-_Outcome = Answer | InputError
-_Waiting = tuple[Request, "asyncio.Future[_Outcome]"]
+_Waiting = tuple[Request, "asyncio.Future[Answer]"]
 
 
 class _Batcher:
@@ -204,7 +203,7 @@ class _Batcher:
 
     def __init__(
         self,
-        answers: Callable[[Sequence[Request]], list[_Outcome]],
+        answers: Callable[[Sequence[Request]], list[Answer | InputError]],
         metrics: _Metrics,
         limits: ServerLimits,
     ) -> None:
@@ -213,11 +212,11 @@ class _Batcher:
         self._thread = ThreadPoolExecutor(1, "forward")
         self._running: asyncio.Task[None] | None = None
 
-    async def answer(self, request: Request) -> _Outcome:
-        """The answer to a request, or what is wrong with it; HTTPException if too many wait."""
+    async def answer(self, request: Request) -> Answer:
+        """The answer to a request; InputError for a wrong one, HTTPException if too many wait."""
         if len(self._queue) >= self._limits.queue:
             raise HTTPException(503, "too many requests wait; try again later")
-        outcome: asyncio.Future[_Outcome] = asyncio.get_running_loop().create_future()
+        outcome: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._queue.append((request, outcome))
         self._metrics.waiting.set(len(self._queue))
         if self._running is None or self._running.done():
@@ -244,7 +243,7 @@ class _Batcher:
             for (_, waiting), outcome in zip(batch, outcomes, strict=True):
                 if waiting.done():
                     continue
-                if isinstance(outcome, (Answer, InputError)):
+                if isinstance(outcome, Answer):
                     waiting.set_result(outcome)
                 else:
                     waiting.set_exception(outcome)
@@ -371,7 +370,7 @@ async def _answer_http(
             body = await _read_body(http, responder.limits.bytes)
             arrived = True
             request: Request = parse(Request, body, responder.limits)
-            outcome = await batcher.answer(request)
+            answer = await batcher.answer(request)
     except HTTPException as error:
         return error.status_code, {"error": error.detail}
     except InputError as error:
@@ -384,11 +383,9 @@ async def _answer_http(
     except Exception:
         traceback.print_exc(file=sys.stderr)
         return 500, {"error": "internal error (a bug, or out of memory); see the server's log"}
-    if isinstance(outcome, InputError):
-        return 400, {"error": str(outcome)}
     if exposures is not None:
-        exposures.add(request.user_id, outcome)
-    return 200, outcome.as_dict(request.user_id)
+        exposures.add(request.user_id, answer)
+    return 200, answer.as_dict(request.user_id)
 
 
 async def _read_body(http: HTTPRequest, most: int) -> bytes:
@@ -413,14 +410,5 @@ def _respond(status: int, body: Any, headers: Any = None) -> Response:
 def _describe_requests() -> dict[str, Any]:
     """The body of requests, for OpenAPI: a JSON schema without references, which lie elsewhere."""
     schema = Request.model_json_schema()
-    definitions = schema.pop("$defs", {})
-
-    def inline(value: Any) -> Any:
-        if isinstance(value, dict):
-            if "$ref" in value:
-                return inline(definitions[value["$ref"].rpartition("/")[2]])
-            return {name: inline(entry) for name, entry in value.items()}
-        return [inline(entry) for entry in value] if isinstance(value, list) else value
-
-    body = {"required": True, "content": {_JSON: {"schema": inline(schema)}}}
-    return {"requestBody": body}
+    schema["properties"]["history"]["items"] = schema.pop("$defs")["Row"]
+    return {"requestBody": {"required": True, "content": {_JSON: {"schema": schema}}}}

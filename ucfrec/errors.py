@@ -57,7 +57,9 @@ def one_line(text: str) -> str:
     if text.isprintable():
         return text
     spaced = (" " if character.isspace() else character for character in text)
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in spaced)
+    return "".join(
+        character if character.isprintable() else repr(character)[1:-1] for character in spaced
+    )
 
 
 def explain_os_error(error: OSError) -> str:

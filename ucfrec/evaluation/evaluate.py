@@ -222,13 +222,13 @@ def variety_columns(
         row["diversity"] = diversity(episodes, items, incidence)
     if counts is None or numbers is None:
         return row
-    shown, liked = (
+    impressions, liked = (
         np.bincount(numbers[numbers >= 0], counted.numpy()[numbers >= 0], n_items)
         for counted in (counts.shown, counts.liked)
     )
-    if shown.any():
+    if impressions.any():
         # In nats; an item that was never shown counts as the rarest.
-        popularity = shown / counts.episodes
+        popularity = impressions / counts.episodes
         popularity = np.maximum(popularity, popularity[popularity > 0].min())
         row["novelty"] = float(-np.log(popularity[items]).mean())
     if incidence is not None and liked.any():

@@ -85,9 +85,9 @@ def gauc(scored: pd.DataFrame) -> float:
     has `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
     """
     _require(scored, "scored", [USER_ID, "score", "liked"])
-    if other := (~scored["liked"].isin([0, 1])).sum():
+    if unusable := (~scored["liked"].isin([0, 1])).sum():
         raise InputError(
-            f"scored: liked is neither true nor false in {other:,} rows; give true and false, or 1 "
+            f"scored: liked is neither true nor false in {unusable:,} rows; give true and false, or 1 "
             "and 0, and leave rows out where it is not known"
         )
     if missing := scored["score"].isna().sum():
@@ -212,9 +212,9 @@ def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
     return len(items)
 
 
-def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> None:
+def _require_comparable(ids: pd.Series, reference: pd.Series, of_others: str) -> None:
     """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
-    kinds = [_KINDS.get(infer_dtype(np.asarray(column)), "") for column in (ids, others)]
+    kinds = [_KINDS.get(infer_dtype(np.asarray(column)), "") for column in (ids, reference)]
     if {*kinds} == {"numbers", "text"}:
         raise InputError(
             f"{ids.name} holds {kinds[0]} in recommended, but {kinds[1]} in {of_others}; convert "

@@ -236,9 +236,9 @@ resampled."""
 def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Float64Array]]:
     """By measure, numerators and denominators (U,) per user; its value is Σ above / Σ below."""
     users, owner = np.unique(period.users, return_inverse=True)
-    shown = ranked.top == period.items[:, None]
-    hit = shown.any(axis=1)
-    gain = (shown / np.log2(2 + np.arange(shown.shape[1]))).sum(axis=1)
+    matches = ranked.top == period.items[:, None]
+    hit = matches.any(axis=1)
+    gain = (matches / np.log2(2 + np.arange(matches.shape[1]))).sum(axis=1)
     every = np.ones(len(owner))
     liked = period.liked.astype(np.float64)
     counted = np.bincount(period.items, minlength=period.n_items)

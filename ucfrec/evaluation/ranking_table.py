@@ -149,18 +149,19 @@ def baselines(
         train: the training episodes; None if unavailable, which excludes what learns from rows.
         liked_of: which training steps were liked; `counts` has its own, boosted clicks the run's.
     """
-    shown, liked = counts.shown.double(), counts.liked.double()
-    drawn = torch.Generator().manual_seed(seed)
+    impressions, liked = counts.shown.double(), counts.liked.double()
+    generator = torch.Generator().manual_seed(seed)
     rankers: list[Ranker] = [
         NamedRanker(
-            "random", lambda steps: torch.rand(len(steps.steps), len(shown), generator=drawn)
+            "random",
+            lambda steps: torch.rand(len(steps.steps), len(impressions), generator=generator),
         ),
-        same_for_all("most shown", shown),
+        same_for_all("most shown", impressions),
         same_for_all("most clicked", liked),
         same_for_all("item click rate", shrink_rates(counts)),
     ]
     if train is not None:
-        rankers.append(neighbour_ranker(train, shown.float()))
+        rankers.append(neighbour_ranker(train, impressions.float()))
         config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
         boosted = BoostedPolicy(config, policy_sizes(train))
         boosted.start_from(train)
@@ -173,7 +174,7 @@ def baselines(
         rankers.append(NamedRanker("boosted clicks", scores))
         if find_spec("implicit") is not None:
             rankers += [
-                factor_ranker(name, train, shown.float(), seed, liked_of)
+                factor_ranker(name, train, impressions.float(), seed, liked_of)
                 for name in get_args(_Factors)
             ]
     if train is not None and store is not None and store.split("validation").n_episodes:

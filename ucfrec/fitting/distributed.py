@@ -122,7 +122,9 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
 
     `count` is the number of rows of this process that its loss is a mean of.
     """
-    gradients = [(each, each.grad) for each in parameters if each.grad is not None]
+    gradients = [
+        (parameter, parameter.grad) for parameter in parameters if parameter.grad is not None
+    ]
     dense = [grad for _, grad in gradients if not grad.is_sparse]
     total = torch.tensor(float(count), device=gradients[0][1].device)
     # One message takes less time than one for every gradient.

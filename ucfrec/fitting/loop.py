@@ -257,21 +257,21 @@ class _Training:
         """Save the weights if their validation loss, which is returned, is the lowest so far."""
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
-        found = {}
+        losses = {}
         with nullcontext() if self._average is None else self._average.applied():
             if validate is not None:
                 self._module.eval()
                 with torch.no_grad():
-                    found["validation_loss"] = loss = validate()
+                    losses["validation_loss"] = loss = validate()
                 self._require_finite("validation loss", loss, step)
                 if loss >= self.counters["best_validation"]:
                     self.counters["stale"] += 1
-                    return found
+                    return losses
                 self.counters |= {"best_validation": loss, "stale": 0}
             self.counters["best_step"] = step
             if distributed.leads():
-                save_tensors(self._best, self._module.state_dict(), {"step": step, **found})
-        return found
+                save_tensors(self._best, self._module.state_dict(), {"step": step, **losses})
+        return losses
 
     def _require_finite(self, quantity: str, value: float, step: int) -> None:
         if not math.isfinite(value):

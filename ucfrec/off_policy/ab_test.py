@@ -140,9 +140,9 @@ def compare_arms(
     without_value: dict[str, int] = {}
     for arm in map(str, np.unique(groups[schema.ARM][counts])):
         inside = counts & (groups[schema.ARM] == arm)
-        values, shown, rows = (groups[part][inside] for part in ("value", "shown", "rows"))
-        sums[arm] = np.stack([values, shown.astype(np.float64)])[:, shown > 0]
-        without_value[arm] = int((rows - shown).sum())
+        values, with_value, rows = (groups[part][inside] for part in ("value", "shown", "rows"))
+        sums[arm] = np.stack([values, with_value.astype(np.float64)])[:, with_value > 0]
+        without_value[arm] = int((rows - with_value).sum())
     users = {arm: values.shape[1] for arm, values in sums.items()}
     names = arms or sorted(users, key=lambda arm: -users[arm])
     if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:

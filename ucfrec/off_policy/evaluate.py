@@ -140,7 +140,7 @@ def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
 class OffPolicyReport(ResultTable):
     """The estimates, and whether to believe them."""
 
-    shown = ("choice", "R_cum", "R_cum_low", "R_cum_high", "effective_sessions", "sessions")
+    headings = ("choice", "R_cum", "R_cum_low", "R_cum_high", "effective_sessions", "sessions")
 
     rows: list[ResultRow]
     """One result row for each estimator."""

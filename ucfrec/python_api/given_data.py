@@ -231,7 +231,6 @@ def read_histories(
 
 
 def _write_frame(frame: Any, scratch: Path) -> Path:
-    """A frame as a file that is read like any log."""
     file = scratch / _FRAME
     pq.write_table(log_table(frame, "data"), file)
     return file

@@ -110,10 +110,12 @@ def export(
         runner = _start_runner(path)
         for sessions in (_COMPARED, 1):
             arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
-            found = _run_graph(runner, arguments)
+            results = _run_graph(runner, arguments)
             with torch.no_grad():
                 expected = graph(**arguments)
-            pairs = zip(found[::2], expected[::2], strict=True)  # scores, without numbers of items
+            pairs = zip(
+                results[::2], expected[::2], strict=True
+            )  # scores, without numbers of items
             size = measure_magnitude(graph.scorer)
             difference = max(difference, require_close(pairs, _SERVE, size))
         sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}

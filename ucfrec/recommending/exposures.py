@@ -152,10 +152,20 @@ class ExposureLog:
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
         rows = [
-            (user, item, now, each.request_id, position, chance, each.run, each.rule, each.arm)
-            for user, now, each in waiting
+            (
+                user,
+                item,
+                now,
+                answer.request_id,
+                position,
+                chance,
+                answer.run,
+                answer.rule,
+                answer.arm,
+            )
+            for user, now, answer in waiting
             for position, (item, chance) in enumerate(
-                zip(each.items, each.propensities, strict=True), 1
+                zip(answer.items, answer.propensities, strict=True), 1
             )
         ]
         frame = pd.DataFrame(rows, columns=self._schema.names)

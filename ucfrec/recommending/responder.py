@@ -127,6 +127,8 @@ class Responder:
         scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
+        if engine not in (TORCH, ONNXRUNTIME):
+            raise InputError(f"the engine is {engine!r}; give {TORCH} or {ONNXRUNTIME}")
         if engine == ONNXRUNTIME:
             from ucfrec.recommending.export import ScoreGraph
 

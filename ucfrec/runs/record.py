@@ -272,9 +272,9 @@ class RunRecord(TrainingRecord):
 
     def is_of(self, store: StoreRecord) -> bool:
         """Whether the run was trained on a store: on the same steps and item states."""
-        own, others = self.files.get(ITEM_STATES), store.files.get(ITEM_STATES)
+        run_states, store_states = self.files.get(ITEM_STATES), store.files.get(ITEM_STATES)
         # A store whose states a caller made lists no file of them.
-        same_states = own is None or others is None or own == others
+        same_states = run_states is None or store_states is None or run_states == store_states
         return self.fingerprint == store.fingerprint and same_states
 
     def learned_nothing(self, logged: Container[str]) -> str:

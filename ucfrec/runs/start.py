@@ -70,18 +70,18 @@ def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, confi
         return
     record = RunRecord.read(out)
     if not record.is_of(store.record):
-        own, other = record.fingerprint[:12], store.record.fingerprint[:12]
+        run_log, store_log = record.fingerprint[:12], store.record.fingerprint[:12]
         raise InputError(
-            f"{out} is a run on another store ({record.store}, fingerprint {own}), not on "
-            f"{store.path} ({other}), or on other item states than that has; name another folder"
+            f"{out} is a run on another store ({record.store}, fingerprint {run_log}), not on "
+            f"{store.path} ({store_log}), or on other item states than that has; name another folder"
         )
     started = record.config
     if not config.train.cosine and config.train.steps > started.train.steps:
         # Without a cosine schedule, a run may be resumed with more steps.
         started = replace(started, train=replace(started.train, steps=config.train.steps))
     for table, values in asdict(config).items():
-        before = asdict(started)[table]
-        old, new = (v if isinstance(v, dict) else {table: v} for v in (before, values))
+        earlier_values = asdict(started)[table]
+        old, new = (v if isinstance(v, dict) else {table: v} for v in (earlier_values, values))
         differences = [
             f"{key} is {old.get(key)} in the run, {value} now"
             for key, value in new.items()

@@ -233,8 +233,8 @@ class TrainedPolicy:
                 self.reward_model,
                 self.session_end,
             )
-        kept: Scorer = self._kept["scorer"]
-        return kept.under(rule)
+        cached: Scorer = self._kept["scorer"]
+        return cached.under(rule)
 
     def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
         """`scorer` of a policy of items; an `InputError` if its actions are vectors."""

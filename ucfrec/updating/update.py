@@ -87,8 +87,8 @@ def update_run(
     remedy = "move the run together with its store, or prepare all logs and train again"
     store_before = trained.require_store(remedy)
     if os.path.lexists(out):
-        before = RunRecord.read(out).update if (out / RUN).is_file() else None
-        if before is None or before.run != trained.fingerprint:
+        previous = RunRecord.read(out).update if (out / RUN).is_file() else None
+        if previous is None or previous.run != trained.fingerprint:
             raise InputError(f"{out} exists and is not an update of {run}; name another run folder")
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):

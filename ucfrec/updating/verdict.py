@@ -221,10 +221,10 @@ def measure_drift(
         "rewards": reward_index(rewards, sample.column(schema.REWARD).astype(np.float64)),
     }
     model, (episodes, steps) = old.reward_model, draw_steps(sample, _MOST_STEPS, seed)
-    known = sample.step_values(schema.ITEM, episodes, steps) >= 0
-    if model is None or not known.any():
+    in_catalogue = sample.step_values(schema.ITEM, episodes, steps) >= 0
+    if model is None or not in_catalogue.any():
         return measures
-    reward_rows = RewardRows.at(sample, episodes[known], steps[known], model.reach)
+    reward_rows = RewardRows.at(sample, episodes[in_catalogue], steps[in_catalogue], model.reach)
     scores = score_rows(model, reward_rows)[0]
     predicted = model.expect(scores).double().numpy()
     observed = reward_rows.rewards.double().numpy()

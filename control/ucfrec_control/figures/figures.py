@@ -236,7 +236,7 @@ def _plan_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of the methods that were given more than one target return."""
     methods = grouped(rows, lambda row: (row.task, row.method)).values()
     several = [rows for rows in methods if len({row.target_return for row in rows}) > 1]
-    shown = {id(row) for own in several for row in own}
+    shown = {id(row) for rows in several for row in rows}
     rows_with_targets = [row for row in rows if id(row) in shown]
     for task, task_rows in grouped(rows_with_targets, lambda row: row.task).items():
         lines = [row.as_line() for row in task_rows]

@@ -8,11 +8,11 @@ also leave enough effective users to evaluate it off-policy.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby, product
 from operator import attrgetter
 from statistics import median_high
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -40,10 +40,9 @@ _TIMES: Final = 4
 """… in so many times the sessions: few sessions there say as much of the users as of the rules."""
 _FEWEST: Final = 10
 """Sessions of a half of the users that can disagree, and that can rule a candidate out."""
-_FIRST_PART: Final = 4
-"""One in so many of the sessions are simulated before candidates are ruled out, …"""
-_ERRORS_BEHIND: Final = 3.0
-"""… which are those that are so many standard errors behind the best."""
+_FIRST_PART, _ERRORS_BEHIND = 4, 3.0
+"""One in so many of the sessions are simulated before candidates so many standard errors behind the
+best are ruled out."""
 _SEED_OF_REST: Final = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
 _FAR_OFF: Final = 0.1
@@ -62,8 +61,7 @@ _NEAR_THE_LOG: Final = (
 _value = attrgetter("value")
 
 
-@dataclass(frozen=True)
-class Outcomes:
+class Outcomes(NamedTuple):
     """What happened in n simulated sessions of one rule."""
 
     returns: Float64Array
@@ -72,11 +70,8 @@ class Outcomes:
     """(M,), all that were shown."""
 
     def append(self, more: "Outcomes") -> "Outcomes":
-        return Outcomes(
-            np.concatenate([self.returns, more.returns]),
-            np.concatenate([self.lengths, more.lengths]),
-            np.concatenate([self.items, more.items]),
-        )
+        pairs = zip(self, more, strict=True)
+        return Outcomes._make(np.concatenate(pair) for pair in pairs)
 
 
 class _ManyRules(PolicyActor):

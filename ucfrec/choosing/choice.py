@@ -94,8 +94,8 @@ class Evidence:
     likelihood: float
     """Geometric mean of the probabilities with which the rule shows what was logged."""
     effective_users: float | None = None
-    """Users of equal weight that say as much of the rule as the logged ones, weighted by its over
-    the logged probabilities; of the half with fewer, twice the number; None without any."""
+    """Users of equal weight that say as much of the rule as the logged ones, weighted; twice those
+    of the half with fewer; None without propensities."""
     spread: float = 0.0
     """Variance of the logarithms of the sessions' weights that are not 0, i.e. their tail."""
     value: float | None = None

@@ -140,12 +140,9 @@ class EffectsMean(nn.Module):
 
 
 class CausalRewardModel(nn.Module):
-    """Conditional variational autoencoder of the reward (paper Eq. 2, Algorithm 2).
-
-    Methods take states (..., S), actions (..., A) and rewards (...) in their original units. The
-    decoder is E[r | s, a] plus a term that depends on z; the encoder's input is the residual
-    r − E[r | s, a]. Without `mean_first`, that mean is 0.
-    """
+    """Conditional variational autoencoder of the reward (paper Eq. 2, Algorithm 2), of states
+    (..., S), actions (..., A) and rewards (...) in original units. The decoder is E[r | s, a], or
+    without `mean_first` 0, plus a term of z; the encoder's input is r − E[r | s, a]."""
 
     expected: nn.Sequential | EffectsMean
 
@@ -192,7 +189,7 @@ class CausalRewardModel(nn.Module):
 
     def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Log likelihood and KL of Eq. 2, each (...) in nats, at z = μ + σ·noise, with standard
-        normal noise (..., latent_dim). Inputs are what `given`, residuals what `residual` gives."""
+        normal noise (..., latent_dim), of what `given` and `residual` return."""
         q = self.encode(inputs, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
         error = self._disturbance(inputs, z) - residual

@@ -295,14 +295,11 @@ class UserCalibration:
             return fit_line(scores[part], target[part], bool(model.binary), counts[part])
 
         line = fit_part(np.ones(len(rows), dtype=bool))
-        first, second = (
-            fit_part(half == number) if (half == number).sum() >= _FEWEST else line
-            for number in (0, 1)
-        )
-        slope, intercept = torch.tensor([second, first])[torch.from_numpy(half)].unbind(1)
+        lines = [fit_part(half == n) if (half == n).sum() >= _FEWEST else line for n in (0, 1)]
+        slope, intercept = torch.tensor(lines[::-1])[torch.from_numpy(half)].unbind(1)
         expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
         observed = (counts * rows.rewards).double().numpy()
         off = expected.sum() / observed.sum() - 1 if observed.sum() > 0 else 0.0
         by_user = np.bincount(episodes, expected - (1 + off) * observed)
         error = float(np.sqrt(np.square(by_user).sum()) / abs(observed.sum() or 1.0))
-        return cls(line, (first, second), float(off), error, weights is not None)
+        return cls(line, (lines[0], lines[1]), float(off), error, weights is not None)

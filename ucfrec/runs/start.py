@@ -73,7 +73,8 @@ def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, confi
         run_log, store_log = record.fingerprint[:12], store.record.fingerprint[:12]
         raise InputError(
             f"{out} is a run on another store ({record.store}, fingerprint {run_log}), not on "
-            f"{store.path} ({store_log}), or on other item states than that has; name another folder"
+            f"{store.path} ({store_log}), or on other item states than that has; name another "
+            "folder"
         )
     started = record.config
     if not config.train.cosine and config.train.steps > started.train.steps:

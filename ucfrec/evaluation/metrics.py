@@ -87,8 +87,8 @@ def gauc(scored: pd.DataFrame) -> float:
     _require(scored, "scored", [USER_ID, "score", "liked"])
     if unusable := (~scored["liked"].isin([0, 1])).sum():
         raise InputError(
-            f"scored: liked is neither true nor false in {unusable:,} rows; give true and false, or "
-            "1 and 0, and leave rows out where it is not known"
+            f"scored: liked is neither true nor false in {unusable:,} rows; give true and "
+            "false, or 1 and 0, and leave rows out where it is not known"
         )
     if missing := scored["score"].isna().sum():
         raise InputError(f"scored: score is missing in {missing:,} rows; leave them out")

@@ -22,7 +22,7 @@ from tests.support import killed_training
 from tests.support.together import together
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.fitting.checkpoint import load_tensors, read_metrics, save_tensors
 from ucfrec.fitting.loop import (
     Fit,
     LoopConfig,
@@ -31,7 +31,6 @@ from ucfrec.fitting.loop import (
     fit,
     load_trained,
 )
-from ucfrec.fitting.metrics import read_metrics
 
 ROOT = Path(__file__).parents[2]
 FAST = LoopConfig(

@@ -20,7 +20,7 @@ import ucfrec
 from tests.recommending.test_recommend import SMALL, random_log
 from ucfrec import UCF, EpisodeStore, Recommender
 from ucfrec.errors import InputError, InputNote
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.selection import choose

@@ -12,7 +12,7 @@ from tests.support.report_page import HOSTILE, number, page_of, record_of, rewri
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.fitting.metrics import METRICS, MetricsLog, read_metrics
+from ucfrec.fitting.checkpoint import METRICS, MetricsLog, read_metrics
 from ucfrec.reporting.page import write_report
 from ucfrec.results.rows import append_rows, write_results
 from ucfrec.runs.config import resolve_config

@@ -8,8 +8,7 @@ import torch
 
 from tests.support.tagged import tagged_store
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.fitting.checkpoint import load_tensors
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import load_tensors, read_metrics
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.policy_fit import fit_policy

@@ -24,8 +24,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import load_tensors
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import load_tensors, read_metrics
 from ucfrec.logs.append import append_logs
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.policy_fit import fit_policy

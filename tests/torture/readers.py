@@ -298,8 +298,7 @@ def _mutate_bytes(generator: random.Random, content: bytes) -> bytes:
 def list_readers(inputs: Inputs) -> list[Reader]:
     """The readers of every kind of file."""
     from ucfrec.files.parquet import read_ids
-    from ucfrec.fitting.checkpoint import load_tensors
-    from ucfrec.fitting.metrics import read_metrics
+    from ucfrec.fitting.checkpoint import load_tensors, read_metrics
     from ucfrec.logs.mapping import read_mapping
     from ucfrec.logs.prepare import validate
     from ucfrec.reporting.page import write_report
@@ -370,7 +369,7 @@ def read_store(path: Path) -> list[Any]:
 
 def read_run(path: Path) -> list[Any]:
     """All that ucfrec reads of a run."""
-    from ucfrec.fitting.metrics import read_metrics
+    from ucfrec.fitting.checkpoint import read_metrics
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     parts: list[Any] = []

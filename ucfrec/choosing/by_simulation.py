@@ -253,8 +253,10 @@ class RuleSearch:
         """Whether the log supports what the candidate did, and can evaluate it."""
         if not self.least_users or not self.is_supported(candidate):
             return self.is_supported(candidate)
-        evidence, enough = candidate.evidence, candidate.effective_users >= self.least_users
-        return evidence is not None and enough and evidence.spread <= _WIDEST
+        evidence = candidate.evidence
+        if evidence is None or evidence.spread > _WIDEST:
+            return False
+        return candidate.effective_users >= self.least_users
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]

@@ -94,7 +94,7 @@ class Train(TrainingOptions):
 
     def _describe(self, record: "RunRecord") -> None:
         from ucfrec.files.record import CARD
-        from ucfrec.fitting.metrics import read_metrics
+        from ucfrec.fitting.checkpoint import read_metrics
         from ucfrec.runs.record import REFIT, RUN, read_record
 
         print(record.describe(read_metrics(self.out / "policy")))

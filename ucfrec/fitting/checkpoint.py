@@ -1,6 +1,8 @@
-"""Files of a training that hold tensors with metadata (safetensors)."""
+"""Files of a training: tensors with metadata (safetensors); scalars, for us and TensorBoard."""
 
 import json
+import math
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -11,10 +13,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, require_file
+from ucfrec.files.atomic import atomic_file, json_text, require_file
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
+METRICS: Final = "metrics.jsonl"
+_STEP: Final = "step"
+_LARGEST_STEP: Final = 2**53
+"""The largest range of integers that floats represent exactly."""
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
@@ -91,3 +97,90 @@ def load_weights(
             f"{path} holds weights of another architecture ({first}); use the settings that it was "
             "trained with, or another folder"
         ) from None
+
+
+class MetricsLog:
+    """Writes scalars to `metrics.jsonl`, which is read back, and to an event file of TensorBoard.
+
+    Both are on disk before `add` returns, so a killed training loses nothing that it logged;
+    `tensorboardX.SummaryWriter` would write in a thread. A line is `{"step": 500, "loss": 1.25}`; a
+    value that is not finite becomes null. Training resumes from step `start`.
+    """
+
+    def __init__(self, folder: Path, start: int) -> None:
+        # Not above: it imports boto3 if that is installed, and most commands only read metrics.
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        self._path, self._event = folder / METRICS, Event
+        if self._path.exists():
+            with self._path.open("r+b") as file:  # without the part of a line of a killed process
+                file.truncate(file.read().rfind(b"\n") + 1)
+        # tensorboardX names files by the second; the suffix keeps a quick resumption from reusing
+        # the name.
+        self._events = EventsWriter(str(folder / "events"), f".{start:09d}")
+        if start:  # makes TensorBoard discard events that were logged after the checkpoint
+            log = SessionLog(status=SessionLog.START)
+            self._events.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
+
+    def add(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Log named scalars; the name `step` is reserved."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json_text({_STEP: step, **scalars}) + "\n")
+        event = self._event(wall_time=time.time(), step=step)
+        for name, value in scalars.items():
+            event.summary.value.add(tag=name, simple_value=value)
+        self._events.write_event(event)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Close the event file."""
+        self._events.close()
+
+
+def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
+    """Read `metrics.jsonl` in `folder`, also while the training is running.
+
+    If a resumed training logged a step again, the later line is used. An incomplete last line is
+    ignored.
+
+    Returns:
+        {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
+        if the file does not exist.
+    """
+    path = folder / METRICS
+    if not path.exists():
+        return {}
+    *lines, _incomplete = path.read_bytes().split(b"\n")
+    scalars: dict[str, dict[int, float]] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            step, values = _parse_line(line)
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}, {error}; delete the line, or restore the file"
+            ) from None
+        for name, value in values.items():
+            scalars.setdefault(name, {})[step] = value
+    return {name: dict(sorted(curve.items())) for name, curve in scalars.items()}
+
+
+def _parse_line(line: bytes) -> tuple[int, dict[str, float]]:
+    """Step and scalars of a line; a ValueError says what is wrong with it."""
+    try:
+        values = json.loads(line)
+    except (ValueError, RecursionError):
+        raise ValueError("is not JSON") from None
+    if not isinstance(values, dict):
+        raise ValueError("is not a JSON object")
+    step = values.pop(_STEP, None)
+    if type(step) is not int or not 0 <= step <= _LARGEST_STEP:
+        raise ValueError(f"has no whole number of 0 or more as {_STEP!r}")
+    for name, value in values.items():
+        if value is not None and type(value) not in (int, float):
+            raise ValueError(f"has no number as {name!r}")
+        try:
+            values[name] = math.nan if value is None else float(value)
+        except OverflowError:
+            raise ValueError(f"has too large a number as {name!r}") from None
+    return step, values

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
-from ucfrec.fitting.metrics import MetricsLog
+from ucfrec.fitting.checkpoint import REMEDY, MetricsLog, load_tensors, load_weights, save_tensors
 from ucfrec.processes import progress, random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 

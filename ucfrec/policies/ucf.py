@@ -18,7 +18,6 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
-    embed_time,
     embedding,
     require_heads,
     some_padding,
@@ -270,7 +269,8 @@ class TokenEmbedding(nn.Module):
     def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Embedded time, returns-to-go and states, (B, K, d) each."""
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        time = embed_time(self.embed_timestep, windows)
+        last = self.embed_timestep.num_embeddings - 1
+        time = self.embed_timestep(windows.timesteps.clamp(max=last))
         return time, returns, self.embed_state(windows.states)
 
 

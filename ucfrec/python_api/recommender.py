@@ -19,8 +19,8 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.evaluation.ranking_table import require_one_catalogue
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder, scratch_folder
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.fitting.loop import Callbacks, Watcher
-from ucfrec.fitting.metrics import read_metrics
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.mapping import LogFiles
 from ucfrec.logs.rows import DAY_MS

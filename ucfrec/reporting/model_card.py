@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, claim, read_json, write_json
 from ucfrec.files.record import CARD, MEASURED
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.provenance import config_hash, shorten_paths
 from ucfrec.reporting.tables import Table, format_value, markdown_table

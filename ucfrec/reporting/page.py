@@ -14,7 +14,7 @@ from ucfrec import __version__
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.reporting.model_card import tabulate_user_model
 from ucfrec.reporting.results import (
     conclude,

@@ -108,4 +108,5 @@ def _format_text(value: object) -> str:
         return NONE
     if isinstance(value, float):
         return format_number(value)
-    return one_line(str(value))
+    text = str(value)
+    return text if text.isprintable() else one_line(text)

@@ -23,7 +23,7 @@ from ucfrec.runs.run import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
 Curves = Mapping[str, Mapping[int, float]]
-"""{name: {step: value}}, as from `ucfrec.fitting.metrics.read_metrics`."""
+"""{name: {step: value}}, as from `ucfrec.fitting.checkpoint.read_metrics`."""
 POINTS: Final = 200
 """Most points of a drawn curve."""
 REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}

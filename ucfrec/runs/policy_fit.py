@@ -15,9 +15,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
-from ucfrec.fitting.metrics import MetricsLog
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ucfrec.benchmark.tables import select_best_target
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.charts import save
 from ucfrec.results.rows import ResultRow, read_results

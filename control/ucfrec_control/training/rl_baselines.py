@@ -22,8 +22,7 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, atomic_folder, lock_path, remove_leftovers
 from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
-from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.metrics import MetricsLog
+from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
 from ucfrec.processes import progress, random_state_kept
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.record import RUN, RunRecord, TrainingRecord

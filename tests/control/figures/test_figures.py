@@ -14,7 +14,7 @@ from tests.support.result_rows import result_row
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.files.atomic import read_json
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.results.rows import append_rows
 from ucfrec_control.benchmark.robustness import drops
 from ucfrec_control.figures import diagnostics, plots

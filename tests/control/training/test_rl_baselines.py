@@ -14,7 +14,7 @@ from ucfrec.benchmark.cells import Budget, Evaluation, Method
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.processes import random_state_kept
 from ucfrec.results.rows import read_rows
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT

@@ -21,7 +21,7 @@ from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
-from ucfrec.fitting.metrics import read_metrics
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.results.rows import read_results, read_rows
 from ucfrec.runs.config import resolve_config

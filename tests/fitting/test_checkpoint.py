@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tensorboardX.proto.event_pb2 import Event
 
 from ucfrec.errors import InputError
-from ucfrec.fitting.metrics import METRICS, MetricsLog, read_metrics
+from ucfrec.fitting.checkpoint import METRICS, MetricsLog, read_metrics
 
 
 def logged(folder: Path, start: int, rows: dict[int, dict[str, float]]) -> None:

@@ -283,7 +283,9 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
 def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(trained: TrainedPolicy) -> None:
     store = EpisodeStore.open(trained.folder.parent / "store")
     users, views = users_of(trained.folder, store), training_views(store)
-    scorer = Scorer(trained.policy, trained.rule, store.item_states, trained.returns, users.reward)
+    scorer = Scorer(
+        trained.policy, trained.rule, store.item_states, trained.record.return_to_go, users.reward
+    )
     config = replace(FEW, reward_weights=(0.0, 1.0, 4.0, 8.0), tag_windows=(3, 5))
     given = Problem(scorer, users, {0.9: 2.0, 1.0: 3.0}, *views, config, 0)
     bad = DecisionRule(2.0, reward_weight=1.0, temperature=1.0)

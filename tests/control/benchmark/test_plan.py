@@ -148,7 +148,7 @@ def test_the_best_trajectories_are_cloned(tmp_path: Path, monkeypatch: pytest.Mo
     assert keys == list(product(range(2), rows, ("last", "best")))
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
-    for cell in cells[: len(rows)]:
+    for cell in (cell for cell in cells if cell.training_seed == 0):
         actor = load_run(cell.run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))
         chosen[cell.method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()

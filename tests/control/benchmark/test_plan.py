@@ -119,12 +119,8 @@ def test_a_row_has_the_rate_of_its_policy(table: str, monkeypatch: pytest.Monkey
     for name, method in TABLES[table].items():
         settings = settings_of(BUDGETS["full"], name, method)
         searched = next(m for m, row in SEARCHED.items() if row.policy == method.policy)
-        if method.policy in ALGORITHMS:
-            assert settings == ("steps=1000000", f"learning_rate={rates[searched]:g}")
-            continue
-        assert f"train.learning_rate={rates[searched]:g}" in settings, name
-        own = (*method.settings, *BUDGETS["full"].of_methods.get(name, ()))
-        assert settings[-len(own) :] == own if own else True
+        own = "" if method.policy in ALGORITHMS else "train."
+        assert f"{own}learning_rate={rates[searched]:g}" in settings, name
 
 
 @pytest.mark.slow

@@ -131,12 +131,6 @@ def test_any_gymnasium_environment_is_measured(
     assert rows[0].metrics["length"] == 5
 
 
-def test_sardine_may_be_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
-    budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
-    assert planned(tmp_path, budget).missing() == ["sardine-static"]
-
-
 @pytest.mark.usefixtures("no_data")
 def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
     pages, catalog = ("synthetic-taobao",), ("synthetic-catalog",)
@@ -167,11 +161,16 @@ def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(tmp_path: Path) -> None:
+def test_a_task_that_is_named_is_measured_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
+    budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
+    assert planned(tmp_path, budget).missing() == ["sardine-static"]
     for task, table in product(("synthetic-catalog", "synthetic-taobao"), ("main", "sweeps")):
-        plan = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
-        assert {cell.task for cell in plan.cells(table)} == {task}
-        assert plan.missing() == []
+        named = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
+        assert {cell.task for cell in named.cells(table)} == {task}
+        assert named.missing() == []
 
 
 @pytest.mark.slow

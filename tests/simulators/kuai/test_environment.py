@@ -25,7 +25,6 @@ from ucfrec.evaluation.collect import collect
 from ucfrec.evaluation.evaluate import _item_numbers
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import repeat_action
 from ucfrec_simulators.kuai.behaviors import MASK, Oracle, RandomMask
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
@@ -111,21 +110,6 @@ def test_random_items_have_no_tag_of_the_last_ten_and_are_otherwise_uniform() ->
     counts = np.bincount(np.concatenate(tags), minlength=20) / (12 * 4000)
     assert counts == pytest.approx(0.05, abs=0.005)
     assert not env.boring(MASK).all(axis=1).any()
-
-
-def test_uniform_choice_among_allowed_items_is_uniform() -> None:
-    env = small(20_000, items=31, regime="NX_0", rule="dorl-main")
-    env.reset(seed=0)
-    actor = Uniform(env, 0)
-    forbidden = np.full((20_000, 4), -1)
-    forbidden[:, 1:3] = 30, 4
-    actor.inform({FORBIDDEN: forbidden})
-    chosen, chance = actor.act(np.zeros((20_000, 2), np.float32), np.ones(20_000, bool))
-    np.testing.assert_allclose(chance, 1 / 29)
-    counts = np.bincount(chosen, minlength=31)
-    assert counts[30] == counts[4] == 0
-    allowed = np.delete(counts, [4, 30]) / 20_000
-    assert np.abs(allowed - 1 / 29).max() < 4.5 * np.sqrt(1 / 29 / 20_000)
 
 
 def test_what_does_not_fit_a_masked_item_and_a_deaf_actor_are_refused() -> None:

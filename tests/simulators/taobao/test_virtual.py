@@ -158,10 +158,8 @@ def test_the_best_constant_is_near_the_ceiling_and_the_mixture_varied(
 def test_missing_or_broken_networks_are_named(folder: Path, tmp_path: Path) -> None:
     for name in ("generator_model.pt", "leave_model.pt", "action_model.pt"):
         shutil.copyfile(folder / name, tmp_path / name)
-    VirtualTaobao(tmp_path)
     action = tmp_path / "action_model.pt"
-    whole = action.read_bytes()
-    leave = (tmp_path / "leave_model.pt").read_bytes()
+    whole, leave = action.read_bytes(), (tmp_path / "leave_model.pt").read_bytes()
     for contents in (whole[: len(whole) // 2], b"", b"not a network", leave):
         action.write_bytes(contents)
         with pytest.raises(InputError, match=r"action_model\.pt is not the published network"):

@@ -23,6 +23,7 @@ NUMBERS += "follow_user_num fans_user_num friend_user_num"
 
 def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
     """Small CSV files in the official schema, cut into as many parts as the release has."""
+    folder.mkdir(exist_ok=True)
     generator = np.random.default_rng(0)
     rows, videos, users = 300, 30, 20
     log = {
@@ -66,7 +67,6 @@ PARTS = {"pure": {}, "1k": {}, "27k": {"log_standard": 2, "video_features_basic"
 @pytest.mark.parametrize("suffix", PARTS)
 def test_official_files_of_every_release(tmp_path: Path, suffix: str) -> None:
     source, parts = tmp_path / "data", PARTS[suffix]
-    source.mkdir()
     official(source, suffix, parts)
     files, mapping = DATASET.resolve([source], LogMapping())
     assert len(files) == (5 if parts else 3)
@@ -122,10 +122,8 @@ def test_what_is_dropped_is_what_an_independent_count_finds() -> None:
 
 
 def test_a_run_knows_its_log_is_of_kuairand_whatever_the_next_is_called(tmp_path: Path) -> None:
-    folder, later = tmp_path / "data", tmp_path / "later"
-    folder.mkdir()
-    later.mkdir()
-    official(folder, "pure", {})
+    official(folder := tmp_path / "data", "pure", {})
+    (later := tmp_path / "later").mkdir()
     store, run, out = (str(tmp_path / name) for name in ("store", "run", "scores.parquet"))
     assert main(["prepare", str(folder), "--dataset", "kuairand", "--out", store]) == 0
     assert main(["train", store, "--policy", "popular", "--out", run]) == 0

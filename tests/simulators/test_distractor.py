@@ -135,8 +135,7 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     (where,) = (states == distractor.unsqueeze(1)).all(0).nonzero().flatten().tolist()
     folder = kuairand_folder / "environment"
     for rate in (0.0, 1.0):
-        environment = DistractorEnvironment(name, folder, rate)
-        env = environment.simulator().make(8, folder)
+        env = DistractorEnvironment(name, folder, rate).simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         actor, shown = trained.actor(8, DecisionRule(1.0), ids), list[torch.Tensor]()
 

@@ -210,8 +210,8 @@ def test_catalog_behaviors_are_ordered_and_items_described() -> None:
     means = {name: played(CATALOG, name, 3000).returns.mean() for name in CATALOG.behaviors}
     assert means["random"] * 2 < means["mixture"] < means["popular"] < means["optimal"] - 2
     env = SyntheticCatalog(1)
-    table = env.item_features().to_pandas()
-    np.testing.assert_array_equal(table.filter(like="tag_").to_numpy().argmax(axis=1), env.tags)
+    tags = env.item_features().to_pandas().filter(like="tag_").to_numpy()
+    np.testing.assert_array_equal(tags.argmax(axis=1), env.tags)
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     for configs in paper.values():
         assert [config.augment.edits_per_copy for config in configs] == [0, 1]
         assert {(c.crm.learning_rate, c.crm.epochs) for c in configs} == {(3e-4, 40)}  # Table 4
-    main, ablated = rows[MAIN], rows[MAIN]["ucf-wo-arch"]
+    ablated = rows[MAIN]["ucf-wo-arch"]
     assert (ablated.policy_name, ablated.augment.copies > 0) == ("dt", True)
     steps = {name: config.train.steps for name, config in rows[EQUAL_TIME].items()}
     assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
@@ -91,7 +91,6 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         assert policy.advantage_weights == name.endswith(("-weights", "-both"))
         assert policy.max_return == name.endswith(("-max-return", "-both"))
         assert (config.augment.copies > 0) == (name.startswith("ucf") and "-wo-count" not in name)
-    assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
 @pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=8.5", "ucf=9999999"])
@@ -109,7 +108,6 @@ def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
     contexts = {cell.method: cell.config.policy.context for cell in cells}
     assert contexts.pop("dc-wo-time") == 20
     assert {contexts[name] for name in ("ucf", "dt-wo-time")} == {8}
-    assert {contexts[name] for name in ("bc", "bc-10", "bc-25")} == {1}
 
 
 @pytest.mark.parametrize("table", TABLES)

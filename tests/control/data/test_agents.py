@@ -81,12 +81,11 @@ class _Trap:
 
 def rewritten(file: Path, out: Path, **parts: bytes | None) -> Path:
     """A copy of a zip file with some parts replaced, or excluded."""
-    changed = {name.replace("_", "."): content for name, content in parts.items()}
     with zipfile.ZipFile(file) as old, zipfile.ZipFile(out, "w") as new:
-        for name in old.namelist():
-            content = changed.get(name, old.read(name))
-            if content is not None:
-                new.writestr(name, content)
+        contents = {name: old.read(name) for name in old.namelist()}
+        contents |= {name.replace("_", "."): content for name, content in parts.items()}
+        for name in (name for name in contents if contents[name] is not None):
+            new.writestr(name, contents[name])
     return out
 
 
@@ -103,9 +102,8 @@ def test_nothing_in_the_file_is_executed(tmp_path: Path) -> None:
         bad = rewritten(file, tmp_path / "bad.zip", policy_pth=tensors)
         assert_refused(bad, "cannot be read as data")
     with zipfile.ZipFile(file) as archive:
-        data = json.loads(archive.read("data"))
-    serialized = pickle.dumps(trap).hex()
-    everything = {name: {":type:": "x", ":serialized:": serialized} for name in data}
+        names = json.loads(archive.read("data"))
+    everything = {name: {":type:": "x", ":serialized:": pickle.dumps(trap).hex()} for name in names}
     odd = rewritten(file, tmp_path / "odd.zip", data=json.dumps(everything).encode())
     read_agent(odd, OBSERVATIONS, SPACE, 0.0, 0)
     assert not sprung.exists()

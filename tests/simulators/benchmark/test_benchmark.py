@@ -11,9 +11,9 @@ import pyarrow as pa
 import pytest
 
 from tests.support.real_data import data_folder
-from tests.support.result_rows import read_configurations, result_row
+from tests.support.result_rows import result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -87,13 +87,9 @@ def test_rows_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
     assert_rules_are_those_of_the_runs(rows, tmp_path / "out")
-    configurations = read_configurations(tmp_path)
-    dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
-    assert dims == {8}
     assert str(tmp_path) not in results.read_text()
     assert measured(suite, request) == said
     assert len(read_rows(results)) == len(rows)
-    assert show(suite, ["main", "sweeps"], rows) in said
     # Trained and simulated again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
     weights = {path.stat().st_mtime_ns for path in tmp_path.rglob("best.safetensors")}
@@ -104,8 +100,7 @@ def test_rows_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert first == second
     written = {path.stat().st_mtime_ns for path in tmp_path.rglob("best.safetensors")}
     assert len(written - weights) == 4
-    seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
-    measured(suite, seeds)
+    measured(suite, replace(request, evaluation_seed=5, log_seed=3, logs=1))
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
     assert last.data_fingerprint != again[-1].data_fingerprint

@@ -1,9 +1,5 @@
-"""DT, DC and LSDT answer as their authors' code does, with its weights (`fixtures/`).
-
-The files are of commits e2d82e6 (kzl/decision-transformer), 3db9b9e (beanie00/Decision-ConvFormer)
-and 1feb77a (WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER) with torch 2.13.0 on a CPU;
-`tests/control/fixtures/authors_networks.py` made them.
-"""
+"""DT, DC and LSDT answer as their authors' code does, with its weights: `fixtures/`, written by
+`tests/control/fixtures/authors_networks.py`, which says of which commits."""
 
 from pathlib import Path
 
@@ -47,7 +43,6 @@ BLOCKS = {
         attention.proj_net=out attention.Dynamicconv_layer.linear1=short.gated ln1=norm
         attention.Dynamicconv_layer.linear2=short.out mlp.0=mlp.0 mlp.2=mlp.2 ln2=mlp_norm""",
 }
-"""Names within a block."""
 UNUSED = ("transformer.wte", "predict_return", "predict_rtg", "predict_state")
 
 

@@ -37,7 +37,6 @@ def test_every_field_means_something_and_is_read() -> None:
     [
         (RLConfig, RL | {"algorithm": "sac"}, r"'sac'; it must be 'iql' or 'cql'"),
         (RLConfig, RL | {"steps": 0}, r"rl\.steps is 0; it must be a whole number from 1"),
-        (CollectConfig, {"size": 0}, "size is 0; it must be a whole number from 1"),
         (CollectConfig, {"steps": 10_000}, "learning starts after 10000"),
         (SacConfig, {"target_rate": 0}, r"sac\.target_rate is 0; it must be a number above 0"),
     ],

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files, read_mapping
+from ucfrec.logs.mapping import FeatureTable, LogMapping, read_mapping
 from ucfrec.logs.prepare import validate
 from ucfrec_datasets import generic
 
@@ -39,7 +39,6 @@ def test_folders_called_like_tables_are_tables(tmp_path: Path, given: str) -> No
     assert files == tuple(parts)
     assert mapping.item_features == (FeatureTable((items,), "item_id"),)
     assert validate(files, mapping)["rows_read"] == 40
-    assert log_files([tmp_path / "items.parquet"]) == (items,)
 
 
 def test_feature_tables_of_the_mapping_are_no_log(tmp_path: Path) -> None:

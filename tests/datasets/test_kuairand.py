@@ -16,19 +16,14 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec_datasets.kuairand import DATASET
 
-KEYS = ["user_id", "video_id", "time_ms"]
 FEEDBACK = "is_click is_like is_follow is_comment is_forward is_hate long_view"
 NUMBERS = "is_lowactive_period is_live_streamer is_video_author register_days "
 NUMBERS += "follow_user_num fans_user_num friend_user_num"
 
 
-def real_log() -> tuple[Path, pd.DataFrame]:
-    folder = data_folder("kuairand")
-    return folder, pd.read_parquet(next(folder.glob("log_*.parquet")))
-
-
 def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
     """Small CSV files in the official schema, cut into as many parts as the release has."""
+    folder.mkdir(exist_ok=True)
     generator = np.random.default_rng(0)
     rows, videos, users = 300, 30, 20
     log = {
@@ -72,7 +67,6 @@ PARTS = {"pure": {}, "1k": {}, "27k": {"log_standard": 2, "video_features_basic"
 @pytest.mark.parametrize("suffix", PARTS)
 def test_official_files_of_every_release(tmp_path: Path, suffix: str) -> None:
     source, parts = tmp_path / "data", PARTS[suffix]
-    source.mkdir()
     official(source, suffix, parts)
     files, mapping = DATASET.resolve([source], LogMapping())
     assert len(files) == (5 if parts else 3)
@@ -98,36 +92,29 @@ def test_files_may_be_named_one_by_one(tmp_path: Path) -> None:
     assert len(mapping.item_features) == len(mapping.user_features) == 1
     with pytest.raises(InputError, match=r"no KuaiRand log among 1 file"):
         DATASET.resolve([tmp_path / "user_features_pure.csv"], LogMapping())
-
-
-def test_the_statistics_are_joined_only_when_named(tmp_path: Path) -> None:
-    official(tmp_path, "pure", {})
+    # The statistics, which tell of the future, are joined only when they are named.
     statistics = tmp_path / "video_features_statistic_pure.csv"
     pd.DataFrame({"video_id": [1]}).to_csv(statistics, index=False)
-    assert len(DATASET.resolve([tmp_path], LogMapping())[1].item_features) == 1
-    assert len(DATASET.resolve([tmp_path, statistics], LogMapping())[1].item_features) == 2
+    for paths, tables in (([tmp_path], 1), ([tmp_path, statistics], 2)):
+        assert len(DATASET.resolve(paths, LogMapping())[1].item_features) == tables
 
 
 @pytest.mark.realdata
-def test_duplicates_are_those_an_independent_count_finds() -> None:
-    folder, log = real_log()
+def test_what_is_dropped_is_what_an_independent_count_finds() -> None:
+    folder = data_folder("kuairand")
+    log = pd.read_parquet(next(folder.glob("log_*.parquet")))
     files, mapping = DATASET.resolve([folder], LogMapping())
+    kept = log.drop_duplicates(["user_id", "video_id", "time_ms"])
     report = validate(files, mapping)
-    duplicates = int(log.duplicated(KEYS).sum())
-    assert duplicates == 2979
-    assert report["dropped"] == {**dict.fromkeys(report["dropped"], 0), "duplicate": duplicates}
+    dropped = {**dict.fromkeys(report["dropped"], 0), "duplicate": len(log) - len(kept)}
+    assert report["dropped"] == dropped
+    assert report["dropped"]["duplicate"] == 2979
     assert report["rows_read"] == len(log) == 94_784
     assert report["users"] == log["user_id"].nunique()
     assert report["items"] == log["video_id"].nunique()
-
-
-@pytest.mark.realdata
-def test_videos_of_unknown_length_earn_no_watch_ratio(tmp_path: Path) -> None:
-    folder, log = real_log()
-    files, mapping = DATASET.resolve([folder], LogMapping())
+    # Videos of unknown length earn no watch ratio.
     reward = "least(play_time_ms / duration_ms, 5)"
     report = validate(files, mapping, PrepareOptions(reward=reward))
-    kept = log.drop_duplicates(KEYS)
     known = kept[kept["duration_ms"] > 0]
     assert report["dropped"]["reward_not_finite"] == len(kept) - len(known)
     ratio = np.minimum(known["play_time_ms"] / known["duration_ms"], 5)
@@ -135,10 +122,8 @@ def test_videos_of_unknown_length_earn_no_watch_ratio(tmp_path: Path) -> None:
 
 
 def test_a_run_knows_its_log_is_of_kuairand_whatever_the_next_is_called(tmp_path: Path) -> None:
-    folder, later = tmp_path / "data", tmp_path / "later"
-    folder.mkdir()
-    later.mkdir()
-    official(folder, "pure", {})
+    official(folder := tmp_path / "data", "pure", {})
+    (later := tmp_path / "later").mkdir()
     store, run, out = (str(tmp_path / name) for name in ("store", "run", "scores.parquet"))
     assert main(["prepare", str(folder), "--dataset", "kuairand", "--out", store]) == 0
     assert main(["train", store, "--policy", "popular", "--out", run]) == 0

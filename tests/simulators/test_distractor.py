@@ -61,8 +61,6 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == pytest.approx(agreement, abs=0.03 if flip else 0)
-    rate = planted.record.source.others["distractor"]["rate"]
-    assert rate == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -81,9 +79,8 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
         store = EpisodeStore.write(tmp_path / str(clicks), steps, np.array([4]))
         if 0 in clicks:
             np.testing.assert_array_equal(reward_bit(store), clicks)
-        else:
-            with pytest.raises(InputError, match="no distractor can correlate"):
-                reward_bit(store)
+    with pytest.raises(InputError, match="no distractor can correlate"):
+        reward_bit(store)
     with pytest.raises(InputError, match=r"must be in \[0, 1\]"):
         reward_bit(store, flip=1.5)
 
@@ -101,13 +98,10 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
         first, _ = env.reset(seed=5)
         np.testing.assert_array_equal(first[:, 1:], seen)
         distractors = [first[:, 0]]
-        for action, (observed, rewards, terminated, truncated, info) in zip(
-            actions, steps, strict=True
-        ):
+        for action, (observed, *outcome, info) in zip(actions, steps, strict=True):
             mine = env.step(action)
             np.testing.assert_array_equal(mine[0][:, 1:], observed)
-            for got, wanted in zip(mine[1:4], (rewards, terminated, truncated), strict=True):
-                np.testing.assert_array_equal(got, wanted)
+            np.testing.assert_array_equal(mine[1:4], outcome)
             for row in np.flatnonzero(info.get("_final_obs", [])):
                 final = mine[4]["final_obs"][row]
                 np.testing.assert_array_equal(final[1:], info["final_obs"][row])
@@ -138,15 +132,10 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     episodes, steps = planted.all_steps()
     states = planted.windows(episodes, steps, 1).states[:, 0]
     distractor = torch.from_numpy(reward_bit(planted))
-    same = (states == distractor.unsqueeze(1)).all(0)
-    assert same.sum() == 1
-    where = int(same.nonzero())
+    (where,) = (states == distractor.unsqueeze(1)).all(0).nonzero().flatten().tolist()
     folder = kuairand_folder / "environment"
     for rate in (0.0, 1.0):
-        environment = DistractorEnvironment(name, folder, rate)
-        row = evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))
-        assert row["episodes"] == 20
-        env = environment.simulator().make(8, folder)
+        env = DistractorEnvironment(name, folder, rate).simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         actor, shown = trained.actor(8, DecisionRule(1.0), ids), list[torch.Tensor]()
 

@@ -82,9 +82,6 @@ def test_taobao_behaviors_are_ordered_and_expectations_are_those_played() -> Non
     assert rates["random"] * 3 < rates["mixture"] < rates["best-constant"] / 2
     assert rates["best-constant"] < rates["optimal"] / 2
     assert abs(rates["optimal"] - 9.0) < 0.05
-    _, lengths = SyntheticTaobao().sample_users(20_000, np.random.default_rng(0))
-    assert 6.5 < lengths.mean() < 9
-    assert (lengths.min(), lengths.max()) == (1, 100)
 
 
 def optimal_returns(env: SyntheticCatalog) -> np.ndarray:
@@ -130,19 +127,17 @@ def test_boredom_against_a_plain_reading_of_the_rule() -> None:
     for _ in range(400):
         actions = generator.integers(200, size=16)
         users = env.users.copy()
-        _, rewards, terminated, truncated, info = env.step(actions)
-        assert set(np.unique(rewards)) <= {0.0, 1.0}
+        _, _, terminated, truncated, info = env.step(actions)
         for row, history in enumerate(shown):
             tag = int(env.tags[actions[row]])
             bored = tag in history[-3:]
             history.append(tag)
             assert terminated[row] == bored
             assert truncated[row] == (len(history) == 7 and not bored)
-            if terminated[row] or truncated[row]:
-                assert info["final_info"]["user_id"][row] == users[row]
+            ended = terminated[row] or truncated[row]
+            assert (info["final_info"] if ended else info)["user_id"][row] == users[row]
+            if ended:
                 history.clear()
-            else:
-                assert info["user_id"][row] == users[row]
         bored_ends += terminated.sum()
         capped_ends += truncated.sum()
     assert min(bored_ends, capped_ends) > 20
@@ -164,15 +159,12 @@ def test_clicks_have_the_stated_probability_and_moods_are_not_told() -> None:
             for mood, chance in enumerate(chances):
                 group = clicks[(users == user) & (good == mood)]
                 assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
-    best = moody.favourites(moody.click_probabilities)
-    np.testing.assert_array_equal(best, calm.favourites(calm.click_probabilities))
 
 
 def even_tags_and_clicks(mood: float, behavior: str) -> np.ndarray:
     """Click rates of odd and of even tags in a log, each relative to what causes clicks."""
     catalogue = synthetic_catalog.simulator(mood)
     env = catalogue.make(256, None)
-    assert isinstance(env, SyntheticCatalog)
     _, steps = play(env, catalogue.behaviors[behavior](env, 0), 3000, 0)
     items = steps["actions"]
     luck = steps["rewards"] - env.click_probabilities[steps["user_ids"], items]
@@ -208,7 +200,6 @@ def test_the_mixture_reports_the_propensity_of_the_actor_in_charge() -> None:
     actor = mixture(env, 0)
     actor.begin(np.arange(500))
     _, propensity = actor.act(observations, np.ones(500, dtype=bool))
-    assert propensity is not None
     uniform = actor.component == 0
     np.testing.assert_allclose(propensity[uniform], 1 / 200)
     assert propensity[~uniform].mean() > 3 / 200
@@ -219,9 +210,8 @@ def test_catalog_behaviors_are_ordered_and_items_described() -> None:
     means = {name: played(CATALOG, name, 3000).returns.mean() for name in CATALOG.behaviors}
     assert means["random"] * 2 < means["mixture"] < means["popular"] < means["optimal"] - 2
     env = SyntheticCatalog(1)
-    table = env.item_features().to_pandas()
-    assert table["item_id"].tolist() == list(range(200))
-    np.testing.assert_array_equal(table.filter(like="tag_").to_numpy().argmax(axis=1), env.tags)
+    tags = env.item_features().to_pandas().filter(like="tag_").to_numpy()
+    np.testing.assert_array_equal(tags.argmax(axis=1), env.tags)
 
 
 @pytest.mark.parametrize(
@@ -229,12 +219,10 @@ def test_catalog_behaviors_are_ordered_and_items_described() -> None:
     [
         (lambda: SyntheticCatalog(1, n_tags=3), "boredom_window"),
         (lambda: SyntheticCatalog(1, mood=-1.0), "mood is -1"),
-        (lambda: SyntheticTaobao(0), "num_envs"),
         (lambda: CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0), "not SyntheticTaobao"),
-        *(
-            (lambda items=items: stepped(SyntheticCatalog(2), items), "from 0 to 199")
-            for items in ([0, 200], [-1, 0], [0.5, 1.0])
-        ),
+        (lambda: stepped(SyntheticCatalog(2), [0, 200]), "from 0 to 199"),
+        (lambda: stepped(SyntheticCatalog(2), [-1, 0]), "from 0 to 199"),
+        (lambda: stepped(SyntheticCatalog(2), [0.5, 1.0]), "from 0 to 199"),
         (lambda: stepped(SyntheticTaobao(2), np.zeros((2, 26), np.float32)), "shape"),
         (lambda: stepped(SyntheticTaobao(2), np.full((2, 27), np.nan, np.float32)), "finite"),
     ],

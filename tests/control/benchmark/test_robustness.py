@@ -7,15 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.control_files import (
-    MADE,
-    TINY,
-    Columns,
-    control,
-    hopper_like,
-    set_options,
-    write_hdf5,
-)
+from tests.support.control_files import MADE, TINY, control, hopper_like, set_options, write_hdf5
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec import schema
@@ -41,8 +33,6 @@ from ucfrec_control.training.train import train_control
 @pytest.mark.parametrize("early", [False, True])
 def test_a_distractor_tells_of_the_reward(folder: Path, tmp_path: Path, early: bool) -> None:
     store = EpisodeStore.open(folder / "store")
-    # Every twentieth trajectory is for validation.
-    assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
     seen = add_distractor(store, tmp_path / "distracted", early=early)
     assert seen.record.source.others["distractors"][0]["early"] == early
     episodes, steps = store.all_steps()
@@ -74,7 +64,6 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
         row("none", -1.0, seed=1), row("early", 5.0, seed=1), row("early", 5.0, method="dc"),
     ]  # fmt: skip
     found = {(d["distractor"], d["training_seed"]): d for d in drops(rows)}
-    assert found.keys() == {("early", 0), ("stochastic", 0), ("early", 1)}
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
     assert (early["score_at_one"], early["drop_at_one"]) == (40.0, 50.0)
@@ -85,46 +74,37 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
 QUICK = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50)
 
 
-def screenable() -> Columns:
+def write_screenable(path: Path) -> Path:
     """One dimension is the reward, another a constant, which causes nothing."""
     columns = hopper_like((30, 8, 25) * 8)
     columns["observations"][:, 4] = 0.0
-    columns["rewards"] = columns["observations"][:, 0]
-    return columns
-
-
-def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str], Path]:
-    """Screened runs of a file and a distractor begun in `out`, by distractor and method."""
-    budget = Budget("small", (MADE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
-    monkeypatch.setitem(BUDGETS, "small", budget)
-    monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
-    kinds = {kind: DISTRACTORS[kind] for kind in ("none", "deterministic")}
-    monkeypatch.setattr(plan, "DISTRACTORS", kinds)
-    write_hdf5(tmp_path / f"{MADE}.hdf5", screenable())
-    # Begun here, where screening may be made quick, and gone on with by the command.
-    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
-    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
-    runs, stages = {}, SharedStages(tmp_path / "stages")
-    for cell in plan.robustness_cells(tmp_path, tmp_path / "out", budget):
-        assert cell.run is not None
-        runs[str(cell.conditions["distractor"]), cell.method] = cell.run
-        if cell.screening is not None:
-            own = {"screening": cell.screening, "shared": stages}
-            train_control(open_store(cell), cell.run, cell.config, **own)
-    return runs
+    return write_hdf5(path, columns | {"rewards": columns["observations"][:, 0]})
 
 
 @pytest.mark.slow
 def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, results = tmp_path / "out", tmp_path / "rows.jsonl"
-    runs = begin(tmp_path, monkeypatch)
+    budget = Budget("small", (MADE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
+    monkeypatch.setitem(BUDGETS, "small", budget)
+    monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
+    kinds = {kind: DISTRACTORS[kind] for kind in ("none", "deterministic")}
+    monkeypatch.setattr(plan, "DISTRACTORS", kinds)
+    write_screenable(tmp_path / f"{MADE}.hdf5")
+    # Begun here, where screening may be made quick, and gone on with by the command.
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
+    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
+    runs, stages = {}, SharedStages(tmp_path / "stages")
+    for cell in plan.robustness_cells(tmp_path, out, budget):
+        runs[str(cell.conditions["distractor"]), cell.method] = cell.run
+        if cell.screening is not None:
+            own = {"screening": cell.screening, "shared": stages}
+            train_control(open_store(cell), cell.run, cell.config, **own)
     command = ("robustness", "--data", tmp_path, "--out", out, "--results", results)
     printed = control(*command)[0]
     rows, before = read_rows(results), results.read_text()
     kinds_of = {(r.method, r.conditions["distractor"]): r.details.get("distractors") for r in rows}
     assert kinds_of.keys() == {(method, kind) for kind, method in runs}
     assert all(bool(added) == (kind != "none") for (_, kind), added in kinds_of.items())
-    assert {r.checkpoint for r in rows} == {"last"}
     for r in rows:
         kind = str(r.conditions["distractor"])
         for value, name in ((0.0, "score"), (1.0, "score_at_one")):
@@ -136,12 +116,9 @@ def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         blind = kind == "none" or r.method == "ucf-dropped"
         assert (r.metrics["loss"] == r.metrics["loss_at_zero"]) == blind
         assert not blind or r.metrics["score"] == r.metrics["score_at_one"]
-    assert {r.evaluation_seed for r in rows} == {1000}
     for dropped in drops(rows):
         assert f"{dropped['drop']:.4g}" in printed
-    rises = loss_rises(rows)
-    assert {r["distractor"] for r in rises} == {"deterministic"}
-    for rise in rises:
+    for rise in loss_rises(rows):
         assert rise["loss"] * (1 + rise["rise"] / 100) == pytest.approx(rise["loss_at_zero"])
         assert f"{rise['loss']:.4g}" in printed
     made, _ = make_figures([], [results], tmp_path / "figures")
@@ -154,7 +131,6 @@ def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     report = details[0]["screening"]
     assert [d["dimension"] for d in report if d["distractor"]] == [11]
     assert screened["deterministic"]["flagged"] is report[11]["flagged"] is True
-    assert screened["deterministic"]["effect"] == report[11]["effect"]
     control(*command)
     assert results.read_text() == before
     assert control("robustness", "--show-only", "--results", results)[0] == printed
@@ -166,16 +142,14 @@ def test_screening_is_recorded_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: config)
     store, run = tmp_path / "store", tmp_path / "run"
-    control("prepare", write_hdf5(tmp_path / "hopper.hdf5", screenable()), "--out", store)
+    control("prepare", write_screenable(tmp_path / "hopper.hdf5"), "--out", store)
     command = ("train", store, "--out", run, "--policy", "bc", "--screen", "copies")
     command += tuple(set_options(("train.steps=2", "policy.dim=8")))
     printed = control(*command)[0]
     screening = RunRecord.read(run).screening
-    assert screening is not None
     assert 4 in screening.flagged
     said = ", ".join(map(str, screening.flagged))
     assert f"columns without effect: {said}\n" in printed
-    assert len(screening.dimensions) == 11
     control(*command)
     assert RunRecord.read(run).screening == screening
 

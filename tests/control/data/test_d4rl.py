@@ -7,8 +7,6 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import LOCK, SCRATCH
 from ucfrec_control.data.d4rl import read_d4rl, require_inside, write_d4rl
-from ucfrec_control.data.minari import is_minari, read_minari, write_minari
+from ucfrec_control.data.minari import read_minari, write_minari
 from ucfrec_control.environments.scores import find_kind, require_task
 
 LENGTHS, FINAL = (4, 1, 6, 3), "infos/final_observations"
@@ -70,15 +68,13 @@ def test_an_unfinished_last_trajectory_is_dropped_and_counted(tmp_path: Path) ->
     columns[FINAL] = columns[FINAL][:-1]
     read = read_d4rl(write_hdf5(tmp_path / "a.hdf5", columns))
     assert read.lengths.tolist() == [4, 1, 6]
-    assert len(read.observations) == 11
     assert read.source["dropped"]["unfinished_steps"] == 3
 
 
 def test_steps_on_the_goal_are_dropped_of_antmaze_alone(tmp_path: Path) -> None:
     columns = hopper_like(LENGTHS)
-    n = len(columns["rewards"])
     ant = {name: columns[name] for name in ("rewards", "terminals", "timeouts")}
-    ant |= {"observations": np.zeros((n, 29)), "actions": np.zeros((n, 8))}
+    ant |= {"observations": np.zeros((14, 29)), "actions": np.zeros((14, 8))}
     read = read_d4rl(write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant, env_id=None))
     assert read.lengths.tolist() == [4, 6, 3]
     assert read.source["dropped"]["one_step_trajectories"] == 1
@@ -103,14 +99,14 @@ def test_ends_are_derived_where_timeouts_are_missing(tmp_path: Path) -> None:
         read_d4rl(write_hdf5(tmp_path / "c.hdf5", columns))
 
 
-def test_d4rl_files_are_of_v4_environments(tmp_path: Path) -> None:
-    file = write_hdf5(tmp_path / "hopper_medium_expert-v2.hdf5", hopper_like(), env_id=None)
-    assert read_d4rl(file).source["env_id"] == "Hopper-v4"
-    assert read_d4rl(file, env_id="Hopper-v5").source["env_id"] == "Hopper-v5"
-    unknown = write_hdf5(tmp_path / "mine.hdf5", hopper_like(), env_id=None)
-    assert read_d4rl(unknown).source["env_id"] is None
-    # A name that the user gives counts, that of the file no longer.
-    assert read_d4rl(write_hdf5(tmp_path / "halfcheetah.hdf5", hopper_like()), "Hopper-v5")
+def test_names_tell_environments_and_kinds(tmp_path: Path) -> None:
+    for name, given, env_id in (
+        ("hopper_medium_expert-v2", None, "Hopper-v4"),
+        ("halfcheetah", "Hopper-v5", "Hopper-v5"),
+        ("mine", None, None),
+    ):
+        file = write_hdf5(tmp_path / f"{name}.hdf5", hopper_like(), env_id=None)
+        assert read_d4rl(file, given).source["env_id"] == env_id
     assert find_kind("hopper_medium_expert-v2") == "medium-expert"
     assert find_kind("mujoco/hopper/medium-v0") == "medium"
     assert require_task("HalfCheetah-v5").score(12135.0) == 100
@@ -128,12 +124,10 @@ def with_one(value: float) -> Callable[[Array], Array]:
     [
         ({"rewards": None}, "has no rewards"),
         ({"actions": lambda v: v[:-2]}, "actions have 12 rows, rewards have 14"),
-        ({"observations": lambda v: v[:, 0]}, "observations have shape"),
         ({"next_observations": lambda v: v[:, :10]}, "have 10 columns, observations have 11"),
         ({"terminals": lambda v: v + 2.0}, "14 of its terminals are neither 0 nor 1"),
         ({"observations": with_one(np.nan)}, "1 number of its observations is not finite"),
         ({"rewards": with_one(-1e300)}, "1 number of its rewards is beyond single precision"),
-        ({"rewards": lambda v: np.array([b"one"] * len(v))}, "rewards holds .*, not numbers"),
         (dict.fromkeys(("terminals", "timeouts"), np.zeros_like), "no trajectory ends in it"),
         ({"next_observations": None, FINAL: lambda v: v[1:]}, "has 3 rows for 4 trajectories"),
         (
@@ -142,9 +136,7 @@ def with_one(value: float) -> Callable[[Array], Array]:
         ),
     ],
 )
-def test_what_is_not_of_the_layout_is_refused(
-    tmp_path: Path, changes: dict[str, Callable[[Array], Array] | None], says: str
-) -> None:
+def test_other_layouts_are_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
     columns = hopper_like(LENGTHS)
     for name, change in changes.items():
         own = columns.pop(name)
@@ -163,42 +155,35 @@ def virtual(other: str) -> h5py.VirtualLayout:
     return layout
 
 
-OUTSIDE = "values of rewards lie in another file"
+ELSEWHERE = "values of rewards lie in another file"
+HUGE = {"shape": (10**13,), "chunks": (1024,), "compression": "gzip", "dtype": "f4"}
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("add", "says"),
     [
-        (lambda other: {"value": h5py.ExternalLink(other, "rewards")}, "a link to another file"),
-        (lambda _: {"value": h5py.SoftLink("/actions")}, "a link to another name"),
-        (lambda other: {"shape": (14,), "external": [(other, 0, 56)]}, OUTSIDE),
-        (lambda other: {"layout": virtual(other)}, OUTSIDE),
+        (lambda f, o: f.update(rewards=h5py.ExternalLink(o, "rewards")), "a link to another file"),
+        (lambda f, _: f.update(rewards=h5py.SoftLink("/actions")), "a link to another name"),
+        (lambda f, o: f.create_dataset("rewards", 14, "f4", external=[(o, 0, 56)]), ELSEWHERE),
+        (lambda f, o: f.create_virtual_dataset("rewards", virtual(o)), ELSEWHERE),
         (
-            lambda _: {"shape": (10**13,), "chunks": (1024,), "compression": "gzip"},
-            r"rewards claims the shape \(10000000000000,\), but only 0 bytes",
+            lambda f, _: f.create_dataset("rewards", **HUGE),
+            "claims the shape .* only 0 bytes",
         ),
-        (lambda _: {"shape": (10**12,)}, "rewards claims the shape"),
-        (lambda _: {}, "rewards is a group"),
-        (lambda _: {"value": np.zeros((14, 1, 1), "f4")}, "not 1 or 2 dimensions"),
-        (lambda _: {"value": ["a\nb"] * 14}, "not numbers"),
+        (lambda f, _: f.create_group("rewards"), "rewards is a group"),
+        (lambda f, _: f.update(rewards=np.zeros((14, 1, 1), "f4")), "not 1 or 2 dimensions"),
+        (lambda f, _: f.update(rewards=["a\nb"] * 14), "not numbers"),
     ],
 )
 def test_what_is_not_within_the_file_is_refused(
-    tmp_path: Path, make: Callable[[str], dict[str, Any]], says: str
+    tmp_path: Path, add: Callable[[h5py.File, str], object], says: str
 ) -> None:
-    made = make(str(write_hdf5(tmp_path / "other.hdf5", hopper_like())))
     columns = hopper_like()
+    other = write_hdf5(tmp_path / "other.hdf5", columns)
     del columns["rewards"]
     path = write_hdf5(tmp_path / "hopper.hdf5", columns)
     with h5py.File(path, "r+") as file:
-        if "value" in made:
-            file["rewards"] = made["value"]
-        elif "layout" in made:
-            file.create_virtual_dataset("rewards", **made)
-        elif made:
-            file.create_dataset("rewards", dtype="f4", **made)
-        else:
-            file.create_group("rewards")
+        add(file, str(other))
     with pytest.raises(InputError, match=says) as caught:
         read_d4rl(path)
     assert "\n" not in str(caught.value)
@@ -206,7 +191,6 @@ def test_what_is_not_within_the_file_is_refused(
 
 def test_links_in_groups_are_found_and_what_compresses_well_is_read(tmp_path: Path) -> None:
     path = write_hdf5(tmp_path / "hopper.hdf5", hopper_like())
-    require_inside(path)
     with h5py.File(path, "r+") as file:
         file["infos/more"] = h5py.ExternalLink("/etc/passwd", "/")
     with pytest.raises(InputError, match="more is a link to another file"):
@@ -216,7 +200,6 @@ def test_links_in_groups_are_found_and_what_compresses_well_is_read(tmp_path: Pa
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=9)
-        file.attrs["env_id"] = "Hopper-v5"
     assert len(read_d4rl(path).rewards) == 50_000
 
 
@@ -226,9 +209,8 @@ def test_data_of_other_sizes_than_the_named_environment_is_refused(file: Path) -
         asked = ("prepare", source, "--out", file.parent / "store", "--env")
         said = refused(*asked, "HalfCheetah-v5")
         assert "(11, 3), those of halfcheetah are (17, 6)" in said
-    printed, said = control(*asked, "Nope-v9")
+    said = control(*asked, "Nope-v9")[1]
     assert "note: --env Nope-v9: Gymnasium has no such environment here" in said
-    assert "normalised" not in printed
 
 
 def test_truncated_files_and_damaged_columns_are_refused(tmp_path: Path) -> None:
@@ -242,16 +224,14 @@ def test_truncated_files_and_damaged_columns_are_refused(tmp_path: Path) -> None
     for content in (b"", whole[:100], whole[:3000], damaged):
         file.write_bytes(content)
         says = "observations cannot be read" if content is damaged else "damaged or not HDF5"
-        with pytest.raises(InputError, match=rf"hopper\.hdf5:? .*{says}|{says}"):
+        with pytest.raises(InputError, match=says):
             read_d4rl(file)
 
 
 def test_both_formats_make_equal_stores(file: Path, tmp_path: Path, minari_folder: Path) -> None:
     """HDF5 → Minari → HDF5, each to a store."""
     back, stores = tmp_path / "back.hdf5", []
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        control("convert", file, "hopper/mine-v0")
+    control("convert", file, "hopper/mine-v0")
     assert "jax" not in sys.modules  # Minari's own recorder needs it
     control("convert", "hopper/mine-v0", back)
     sources = (file, "hopper/mine-v0", back, minari_folder / "hopper" / "mine-v0")
@@ -259,10 +239,9 @@ def test_both_formats_make_equal_stores(file: Path, tmp_path: Path, minari_folde
         control("prepare", source, "--out", tmp_path / f"store{number}")
         stores.append(EpisodeStore.open(tmp_path / f"store{number}"))
     assert len({store.record.fingerprint for store in stores}) == 1
-    assert {store.record.source.others["env_id"] for store in stores} == {"Hopper-v5"}
     assert [store.record.source.others["format"] for store in stores] == ["d4rl", "minari"] * 2
-    first, last = read_d4rl(file), read_d4rl(back)
-    np.testing.assert_array_equal(first.final_observations, last.final_observations)
+    finals = (read_d4rl(source).final_observations for source in (file, back))
+    np.testing.assert_array_equal(*finals)
 
 
 KILLED = """
@@ -288,35 +267,26 @@ def test_a_killed_conversion_leaves_no_dataset_or_scratch(file: Path, minari_fol
     assert not [path for path in minari_folder.rglob(".*") if path.name.endswith((LOCK, SCRATCH))]
     assert "mine/hopper/mine-v0" in minari.list_local_datasets()
     assert read_minari("mine/hopper/mine-v0").lengths.tolist() == list(LENGTHS)
-    assert {"mine", "mine/hopper"} <= set(minari.namespace.list_local_namespaces())
 
 
 def test_minari_refusals(file: Path) -> None:
-    trajectories = read_d4rl(file)
-    unread, mine = "mujoco/hopper/medium-v0", "hopper/mine-v0"
+    trajectories, mine = read_d4rl(file), "hopper/mine-v0"
 
     def refuse(says: str, use: Callable[..., object], *given: object) -> None:
         with pytest.raises(InputError, match=says):
             use(*given)
 
-    refuse("fetch it with --download", read_minari, unread)
-    if find_spec("huggingface_hub") is None:
-        refuse(r"install ucfrec\[minari\]", partial(read_minari, download=True), unread)
+    refuse("fetch it with --download", read_minari, "mujoco/hopper/medium-v0")
     refuse("not a Minari identifier", write_minari, trajectories, "no identifier")
     folder = write_minari(trajectories, mine)
     refuse("exists already", write_minari, trajectories, mine)
     metadata = folder / "data" / "metadata.json"
     stated = metadata.read_text()
     metadata.write_text(stated.replace("observation_space", "space"))
-    for source in (str(folder), mine):
-        refuse("states no observation and action space", read_minari, source)
+    refuse("states no observation and action space", read_minari, mine)
     metadata.write_text(stated)
     (folder / "data" / "main_data.hdf5").write_bytes(b"nothing")
     refuse(r"main_data\.hdf5 is damaged or not HDF5", read_minari, mine)
-    metadata.write_text(stated[:20])
-    refuse(r"is damaged or not HDF5|cannot be opened", read_minari, mine)
-    assert is_minari("mujoco/hopper/medium-v0")
-    assert not is_minari("hopper_medium-v2.hdf5")
 
 
 def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder: Path) -> None:
@@ -324,21 +294,18 @@ def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder
     box = {"dtype": np.float64, "low": -9.0, "high": 9.0}
     sizes = {"observation": 27, "achieved_goal": 2, "desired_goal": 2}
     rng = np.random.default_rng(0)
-    seen = [{k: rng.uniform(size=(5, n)) for k, n in sizes.items()} for _ in range(2)]
-    no = [False] * 4
-    steps = {"rewards": [0.0, 0.0, 0.0, 1.0], "terminations": no, "infos": {}}
-    buffers = [
-        EpisodeBuffer(observations=seen[i], actions=actions, truncations=ends, **steps)
-        for i, ends in enumerate(([*no[1:], True], no))
-        for actions in [rng.uniform(size=(4, 8))]
-    ]
+    seen = {k: rng.uniform(size=(5, n)) for k, n in sizes.items()}
+    steps = {"rewards": [0.0] * 4, "terminations": [False] * 4, "infos": {}}
+    steps |= {"observations": seen, "actions": rng.uniform(size=(4, 8))}
+    ends = [False, False, False, True], [False] * 4
+    buffers = [EpisodeBuffer(truncations=truncations, **steps) for truncations in ends]
     boxes = {name: spaces.Box(shape=(n,), **box) for name, n in sizes.items()}
     of = {"observation_space": spaces.Dict(boxes), "action_space": spaces.Box(shape=(8,), **box)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         minari.create_dataset_from_buffers("antmaze/made-v0", buffers, **of)
     read = read_minari("antmaze/made-v0", env_id="AntMaze_UMaze-v4")
-    wanted = np.hstack([seen[0]["achieved_goal"], seen[0]["observation"]]).astype(np.float32)
+    wanted = np.hstack([seen["achieved_goal"], seen["observation"]]).astype(np.float32)
     np.testing.assert_array_equal(read.observations, wanted[:4])
     np.testing.assert_array_equal(read.final_observations, wanted[4:])
     assert read.lengths.tolist() == [4]

@@ -18,13 +18,11 @@ from tests.support.control_files import TINY, control, hopper_like, refused, set
 from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source
-from ucfrec.errors import InputError
 from ucfrec.results.rows import read_results
-from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
 from ucfrec_control.environments.environments import antmaze_settings, make_env, mismatches
-from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.environments.scores import require_task
 from ucfrec_control.training.evaluate import load_run, open_environment
 
 needs_robotics = pytest.mark.skipif(
@@ -51,7 +49,6 @@ def simulated(env: Any) -> Float64Array:
 
 
 def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
-    """A D4RL AntMaze file's: floats throughout, no successors."""
     rng, n, hopper = np.random.default_rng(0), sum(lengths), hopper_like(lengths)
     columns = {name: hopper[name] for name in ("terminals", "timeouts")}
     columns |= {"rewards": columns["terminals"], "observations": rng.normal(size=(n, 29))}
@@ -78,7 +75,6 @@ def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_p
     store = read_d4rl(file).write_store(tmp_path / "store")
     stored = store.windows(np.arange(2), np.full(2, 5), 6).states.numpy()
     np.testing.assert_array_equal(stored, np.array(shown)[:-1].swapaxes(0, 1).astype(np.float32))
-    assert np.ptp(stored, axis=1).min() > 0
 
 
 @needs_robotics
@@ -95,8 +91,7 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
         for j, cell in enumerate(row)
     }
     wanted = {at for at, cell in cells.items() if cell == "#"}
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    blocks = [i for i, name in enumerate(names) if name.startswith("block")]
+    blocks = [i for i in range(model.ngeom) if model.geom(i).name.startswith("block")]
     found = model.geom_pos[blocks, :2] - environment.origin
     assert {(round(x), round(y)) for x, y in found} == wanted
     assert gymnasium.spec(env_id).max_episode_steps == limit
@@ -155,9 +150,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "rows.json"
     asked = ("evaluate", run, "--checkpoint", "last", "--target", 1, "--episodes", 1)
-    printed, said = control(*asked, "--json", out)
-    assert "0.0 [0.0, 0.0]" in printed
-    assert f"warning: {REBUILT} is rebuilt" in said
+    assert f"warning: {REBUILT} is rebuilt" in control(*asked, "--json", out)[1]
     (row,) = read_results(out)
     assert (row.environment, row["length"], row["score"]) == (REBUILT, 700, 0)
     assert "have sizes (107, 8)" in refused(*asked, "--env", "AntMaze_UMaze-v5")
@@ -186,7 +179,6 @@ def test_mazes_are_of_the_data(run: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert (source["env_id"], source["env_settings"]["maze_map"]) == ("AntMaze_UMaze-v4", maze)
     assert any("gymnasium-robotics 1.2.0" in text for text in mismatches(source, source["env_id"]))
     policy = load_run(run, "last")
-    assert isinstance(policy, TrainedPolicy)
     data = Source.model_validate(source)
     policy = replace(policy, record=policy.record.copy_with(data=data))
     environment = open_environment(policy, source["env_id"], 1)
@@ -198,25 +190,21 @@ def test_mazes_are_of_the_data(run: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_names_of_d4rl_tell_its_environments() -> None:
-    task = require_task("antmaze")
     file = "Ant_maze_{}-maze_noisy_multistart_True_multigoal_True_sparse_fixed"
     for maze, *names in (
         ("umaze", "antmaze-umaze-v2", "antmaze-umaze-diverse-v2", file.format("u")),
         ("medium", "antmaze-medium-play-v2", file.format("big")),
         ("large", "antmaze-large-diverse-v2", file.format("hardest")),
     ):
-        assert all(require_task(name) == task for name in names)
-        assert {task.d4rl_env(name) for name in names} == {f"d4rl/antmaze-{maze}-v2"}
-    assert task.d4rl_env("antmaze-mine") is None
-    assert find_kind("antmaze-medium-diverse-v2") == "diverse"
+        found = {require_task(name).d4rl_env(name) for name in names}
+        assert found == {f"d4rl/antmaze-{maze}-v2"}
+    assert require_task("antmaze").d4rl_env("antmaze-mine") is None
 
 
 def test_without_robotics_the_extra_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     needs = f"{REBUILT} needs gymnasium-robotics, which is not installed; install ucfrec[antmaze]"
     assert needs in refused("evaluate", run)
-    with pytest.raises(InputError, match="needs gymnasium-robotics"):
-        make_env("AntMaze_UMaze-v4", 1)
 
 
 @needs_robotics

@@ -60,34 +60,24 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
             train_rl(store, tmp_path / "interrupted", config, 0)
     with pytest.raises(InputError, match="has not ended"):
         evaluate_run(tmp_path / "interrupted", episodes=2, seed=0)
-    assert torch.load(tmp_path / "interrupted" / "checkpoint.pt", weights_only=True)["step"] == 4
     train_rl(store, tmp_path / "interrupted", config, 0)
-    actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
-    assert actors[0].read_bytes() == actors[1].read_bytes()
+    train_rl(store, tmp_path / "other", config, 1)
+    names = ("alone", "interrupted", "other")
+    first, second, third = ((tmp_path / n / "actor.safetensors").read_bytes() for n in names)
+    assert first == second != third
     alone, interrupted = (read_metrics(tmp_path / run) for run in ("alone", "interrupted"))
     for loss in ("actor_loss", "critic_loss"):
         assert list(alone[loss]) == [2, 4, 6, 7]
         assert alone[loss] == interrupted[loss]
-
-
-@pytest.mark.parametrize("algorithm", ["iql", "cql"])
-def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
-    store: EpisodeStore, tmp_path: Path, algorithm: str
-) -> None:
-    config = rl_config(dataset_of(store), algorithm, steps=4)
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        train_rl(store, tmp_path / name, config, seed)
-    a, b, c = ((tmp_path / name / "actor.safetensors").read_bytes() for name in "abc")
-    assert a == b != c
-    (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
+    (row,) = evaluate_run(tmp_path / "alone", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
     assert row.data_fingerprint == store.record.fingerprint
-    asked = ("evaluate", tmp_path / "a", "--episodes", 2)
+    asked = ("evaluate", tmp_path / "alone", "--episodes", 2)
     control(*asked)
     assert "keep their last checkpoint only" in refused(*asked, "--checkpoint", "best")
-    assert train_rl(store, tmp_path / "a", config, 0) == RLRecord.read(tmp_path / "a")
+    assert train_rl(store, tmp_path / "alone", config, 0) == RLRecord.read(tmp_path / "alone")
     with pytest.raises(InputError, match="other settings or data"):
-        train_rl(store, tmp_path / "a", config, 1)
+        train_rl(store, tmp_path / "alone", config, 1)
 
 
 def agent_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
@@ -105,29 +95,21 @@ def test_cql_has_the_settings_of_corl() -> None:
     assert scalers.pop(("hopper", "medium")) == "ReturnBasedRewardScaler"
     assert set(scalers.values()) == {"NoneType"}
     for task, hidden in (("walker2d", 3), ("antmaze", 5)):
-        modules = agent_of(task, "medium").impl.modules
-        for critic in modules.q_funcs:
+        for critic in agent_of(task, "medium").impl.modules.q_funcs:
             assert sum(isinstance(m, torch.nn.Linear) for m in critic.modules()) == hidden + 1
-        actor = [m for m in modules.policy.modules() if isinstance(m, torch.nn.Linear)]
-        assert len(actor) == 3 + 2  # mean and deviation
     agent = agent_of("antmaze", "diverse")
     assert (agent.config.reward_scaler.shift, agent.config.reward_scaler.multiplier) == (-5, 10)
-    assert agent.config.alpha_learning_rate == agent.config.critic_learning_rate
-    for config in (agent.config, agent_of("walker2d", "medium").config):
-        assert config.temp_learning_rate == config.actor_learning_rate
 
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
-@pytest.mark.parametrize("task", ["hopper", "antmaze"])
-def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
-    def rates(**settings: float) -> dict[str, float]:
-        config = vars(agent_of(task, "medium", algorithm, **settings).config)
-        return {name: rate for name, rate in config.items() if name.endswith("learning_rate")}
-
-    usual = rates()
+def test_all_rates_keep_their_proportion(algorithm: str) -> None:
+    usual, faster = (
+        {name: rate for name, rate in vars(agent.config).items() if name.endswith("learning_rate")}
+        for given in ({}, {"learning_rate": 3e-3})
+        for agent in [agent_of("antmaze", "medium", algorithm, **given)]
+    )
     assert usual["critic_learning_rate"] == 3e-4
-    ten_times = {name: 10 * rate for name, rate in usual.items()}
-    assert rates(learning_rate=3e-3) == pytest.approx(ten_times)
+    assert faster == pytest.approx({name: 10 * rate for name, rate in usual.items()})
 
 
 def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:
@@ -158,8 +140,6 @@ def test_cql_sees_the_states_of_antmaze_as_they_are(store: EpisodeStore) -> None
     for task, plain in (("antmaze", True), ("hopper", False)):
         mean, std = rl_baselines._statistics(train, RLConfig("cql", 10, task, "medium"))
         assert (not mean.any() and bool((std == 1).all())) == plain
-    mean, _ = rl_baselines._statistics(train, RLConfig("iql", 10, "antmaze", "medium"))
-    assert mean.any()
 
 
 def test_the_benchmark_finds_its_rl_rows_again(

@@ -28,7 +28,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.environments.environments import make_env, mismatches
+from ucfrec_control.environments.environments import make_env
 from ucfrec_control.environments.scores import TASKS
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.train import find_preset, train_control
@@ -43,12 +43,13 @@ def store(folder: Path) -> EpisodeStore:
 
 def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> None:
     run, out = folder / "store-run", tmp_path / "rows.json"
-    printed, said = control("evaluate", run, "--episodes", 3, "--json", out)
-    assert MADE in printed
-    assert "warning" not in said
+    assert "warning" not in control("evaluate", run, "--episodes", 3, "--json", out)[1]
     rows = read_results(out)
     keys = [(r.checkpoint, r.target_return) for r in rows]
     assert keys == list(product(("last", "best"), (3600, 1800)))
+    # The best is played whichever step it is of.
+    (best,) = evaluate_run(run, episodes=3, seed=0, targets=(3600.0,), checkpoints=("best",))
+    assert best["return"] == rows[2]["return"]
     record = read_json(run / "run.json")
     for row in rows:
         assert (row.task, row.method, row.policy, row.training_seed) == (MADE, "dt", "dt", 3)
@@ -56,29 +57,15 @@ def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> No
         scored = 100 * (row["return"] + 20.272305) / (3234.3 + 20.272305)
         assert row["score"] == pytest.approx(scored)
         assert row["score_low"] <= row["score"] <= row["score_high"]
-        assert {"mujoco", "gymnasium", "torch"} <= row.versions.keys()
         assert row["validation_loss"] == record["policy"]["best_validation"] > 0
         assert min(row["wall_time_s"], row["train_wall_time_s"]) > 0
     assert record["data"]["env_id"] == "Hopper-v5"
-    assert record["config"]["train"]["warmup_steps"] == 10_000
-    assert "mujoco" in record["versions"]
-
-
-def test_the_best_checkpoint_is_played_whichever_step_it_is_of(folder: Path) -> None:
-    run = folder / "store-run"
-    both = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,))
-    (best,) = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,), checkpoints=("best",))
-    assert [row["checkpoint"] for row in both] == ["last", "best"]
-    assert both[1]["return"] == best["return"]
 
 
 def test_another_environment_version_warns(folder: Path) -> None:
     asked = (*LAST, "--target", 100, "--env", "Hopper-v4")
     said = control("evaluate", folder / "store-run", *asked)[1]
     assert "warning: the data is of Hopper-v5, the evaluation is in Hopper-v4" in said
-    made = {"env_id": "Hopper-v5", "versions": {"mujoco": "2.1.0"}}
-    (told,) = mismatches(made, "Hopper-v5")
-    assert told.startswith("the data was made with mujoco 2.1.0, ")
 
 
 def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_path: Path) -> None:
@@ -98,9 +85,7 @@ def test_data_imports_nothing(
     monkeypatch.syspath_prepend(tmp_path)
     entry = ("data", "env_id")
     run = changed(folder / "store-run", tmp_path / "run", entry, "theirs:Hopper-v5")
-    said = refused("evaluate", run, "--episodes", 1)
-    assert "the Python module theirs would be run" in said
-    control("evaluate", run, "--episodes", 1, "--env", "Hopper-v5")
+    assert "the Python module theirs would be run" in refused("evaluate", run, "--episodes", 1)
 
 
 def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Path) -> None:
@@ -112,7 +97,6 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     env = make_env("Hopper-v5", 2, [0.0])
     steps: list[Step] = []
     rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)
-    assert {step.observations.shape[1] for step in steps} == {12}
     assert not any(step.observations[:, 11].any() for step in steps)
 
 
@@ -122,9 +106,8 @@ def test_policies_that_know_their_return_are_asked_for(store: EpisodeStore, tmp_
     for policy_name in ("dt", "dc", "lsdt", "ucf"):
         settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(policy_name, [])]
         run = tmp_path / policy_name
-        record = train_control(store, run, resolve_config(policy_name, None, settings))
+        train_control(store, run, resolve_config(policy_name, None, settings))
         assert read_metrics(run / "policy")["value_loss"]
-        assert record.finished.steps == 4
         (row,) = evaluate_run(run, episodes=1, seed=0, checkpoints=("last",))
         assert row["target_return"] is None
         assert "largest return expected" in row["rule"]
@@ -133,28 +116,22 @@ def test_policies_that_know_their_return_are_asked_for(store: EpisodeStore, tmp_
     assert " max " in control("evaluate", run, *LAST)[0]
 
 
-def test_presets_have_the_widths_of_the_paper() -> None:
-    tasks, kinds = ("halfcheetah", "hopper", "walker2d"), ("medium", "medium-replay", "mixed")
-    for policy, task, kind in product(("ucf", "ucf-paper"), tasks, (*kinds, "medium-expert")):
-        width = find_preset(task, kind, policy).tables["policy"].get("dim", 128)
-        assert width == (256 if task == "hopper" and kind in kinds else 128)
-    paper = find_preset("antmaze", "diverse", "ucf-paper").tables
-    assert (paper["policy"]["context"], paper["crm"]["latent_dim"]) == (50, 32)
-    # Copies are the same whichever policy learns from them.
-    assert find_preset("antmaze", "diverse", "dt").tables["crm"] == paper["crm"]
-    for name, scale in {"ucf": 1.0, "dt": 1.0, "dc": 1.0, "lsdt": 1000.0}.items():
-        assert find_preset("antmaze", "", name).tables["policy"]["return_scale"] == scale
-    assert "max_timestep" not in paper["policy"]
-    kinds = (*kinds, "medium-expert", "diverse", "")
+def test_presets_are_those_of_the_papers() -> None:
+    kinds = ("medium", "medium-replay", "mixed", "medium-expert", "diverse", "")
     for policy, task, kind in product(BUILT_IN, TASKS, kinds):
         preset = find_preset(task.name, kind, policy)
         resolve_config(policy, presets=preset.tables)
         assert preset.targets
+        if policy in ("ucf", "ucf-paper") and task.name != "antmaze" and kind in kinds[:4]:
+            wide = task.name == "hopper" and kind != "medium-expert"
+            assert preset.tables["policy"].get("dim", 128) == (256 if wide else 128)
+    paper = find_preset("antmaze", "diverse", "ucf-paper").tables
+    assert (paper["policy"]["context"], paper["crm"]["latent_dim"]) == (50, 32)
+    # Copies are the same whichever policy learns from them.
+    assert find_preset("antmaze", "diverse", "dt").tables["crm"] == paper["crm"]
     for task_name, expected in (("hopper", (8, 256, 1e-4)), ("walker2d", (20, 128, 1e-3))):
         dc = resolve_config("dc", presets=find_preset(task_name, "medium", "dc").tables)
         assert (dc.policy.context, dc.policy.dim, dc.train.learning_rate) == expected
-        assert dc.policy.return_scale == 1000
-    assert find_preset("halfcheetah", "medium", "dt").targets == (12000, 6000)
     assert find_preset("walker2d", "mixed", "lsdt").targets == (10000,)
 
 
@@ -179,7 +156,6 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
     control("train", *where, *set_options(settings))
     control("evaluate", run, "--checkpoint", "last", "--json", out)
     (row,) = read_results(out)
-    assert row["episodes"] == 20
     assert row["score"] > 15
 
 
@@ -197,7 +173,6 @@ def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, fi
     rows = read_results(out)
     assert len(rows) == 2  # one for each of the preset's targets
     for row in rows:
-        assert row.task == file
         assert "warnings" not in row.details
         assert row["score_low"] <= row["score"] <= row["score_high"] < 20  # it has learned nothing
 
@@ -218,9 +193,7 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
     for row in rows:
         assert (row.suite, row.table, row.task) == ("control", "main", MADE)
         assert row.conditions.items() >= {"budget": "small", "episodes": 2}.items()
-        assert row.metrics.keys() >= {"score", "return", "length", "validation_loss"}
         assert (row.training_seed, row.evaluation_seed) == (0, 1000)
-        assert all((row.environment, row.versions, row.commit, row.command))
     assert str(tmp_path) not in before
     control(*command)
     assert results.read_text() == before
@@ -233,10 +206,8 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
     assert f"{earned['last']:.3f}" in control("benchmark", "--show-only", *where)[0]
     file.rename(tmp_path / "hopper_medium-own.hdf5")
     control(*command, "--file", "hopper_medium-own", "--method", "lsdt", "--seeds", 2)
-    more = read_rows(results)[len(again) :]
-    keys = {(r.task, r.method, r.evaluation_seed) for r in more}
-    assert keys == {("hopper_medium-own", "lsdt", 1000)}
-    assert sorted(str(r.training_seed) for r in more) == ["0", "0", "1", "1"]
+    more = [(r.task, r.method, r.training_seed) for r in read_rows(results)[len(again) :]]
+    assert sorted(more) == [("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)]
 
 
 STRANGE: dict[str, list[object]] = {
@@ -252,14 +223,10 @@ STRANGE: dict[str, list[object]] = {
 
 
 @pytest.mark.parametrize(("entry", "value"), [(e, v) for e, vs in STRANGE.items() for v in vs])
-def test_a_strangers_run_is_refused(
-    folder: Path, tmp_path: Path, entry: str, value: object
-) -> None:
+def test_strange_runs_are_refused(folder: Path, tmp_path: Path, entry: str, value: object) -> None:
     run = changed(folder / "store-run", tmp_path / "run", tuple(entry.split()), value)
     said = refused("evaluate", run, "--episodes", 1)
-    assert said.startswith("ucfrec-control evaluate: ")
-    if entry == "policy":
-        assert value is not None or f"the training in {run} has not ended" in said
+    assert (entry, value) != ("policy", None) or f"the training in {run} has not ended" in said
     # A run that says nothing of its data is not one of control, and has no figure.
-    elif value != {} and not any(w in str(value) for w in ("xml_file", "frame_skip")):
+    if entry != "policy" and value != {} and "settings" not in entry:
         refused("figures", "--runs", run, "--out", tmp_path / "figures")

@@ -57,8 +57,7 @@ def test_a_video_has_the_frames_at_the_speed_of_the_environment(run: Path, tmp_p
     about = next(read)
     assert (about["size"], about["fps"], sum(1 for _ in read)) == ((64, 48), 125, 5)
     asked = ("--episodes", 1, "--checkpoint", "last", "--video", tmp_path / "b.mp4")
-    printed = control("evaluate", run, *asked)[0]
-    assert f"b.mp4: an episode of return {earned:.1f}" in printed
+    assert f"b.mp4: an episode of return {earned:.1f}" in control("evaluate", run, *asked)[0]
     assert (tmp_path / "b.mp4").read_bytes() == (tmp_path / "a.mp4").read_bytes()
 
 

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pytest
 
 from tests.support.real_data import data_folder
-from tests.support.result_rows import read_configurations, result_row
+from tests.support.result_rows import result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -53,7 +53,6 @@ def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> 
     runs = {TrainedPolicy.load(path.parent).rule for path in out.rglob(RUN)}
     trained = [row for row in rows if row.training_seed is not None]
     assert {row.rule for row in trained} == {f"{rule} ({rule.hash})" for rule in runs}
-    assert {row.conditions.get("quantiles") for row in trained} == {"rule"}
     of_dt = [row for row in rows if row.method == "dt+shared"]
     assert {row.target_return for row in of_dt} <= {rule.target for rule in runs}
     records = [read_json(path) for path in out.rglob(RUN)]
@@ -62,7 +61,6 @@ def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> 
     assert sorted(tuple(row.metrics[name] for name in names) for row in of_dt) == sorted(
         (each["value"], each["error"]) for each in own
     )
-    assert not any("estimated_value" in row.metrics for row in rows if row not in of_dt)
 
 
 @pytest.mark.slow
@@ -82,9 +80,6 @@ def test_rows_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     # Seed by seed, so that an interrupted table is one of fewer seeds.
     trained = [(n, log, s) for s in (0, 1) for log in (0, 1) for n in some]
     assert [(r.method, r.log_seed, r.training_seed) for r in rows] == [*built_in, *trained]
-    keys = ("recommendation", "main", "synthetic-catalog")
-    assert {(r.suite, r.table, r.environment) for r in rows} == {keys}
-    assert {r.checkpoint for r in rows if r.training_seed is not None} == {"best"}
     assert len({r.data_fingerprint for r in rows if r.training_seed is not None}) == 2
     played = evaluate_behavior(Environment("synthetic-catalog"), "optimal", 8, 1_000_000)
     found = next(row for row in rows if row.method == "optimal")
@@ -92,32 +87,22 @@ def test_rows_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
     assert_rules_are_those_of_the_runs(rows, tmp_path / "out")
-    configurations = read_configurations(tmp_path)
-    dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
-    assert dims == {8}
     assert str(tmp_path) not in results.read_text()
-    pictures = tmp_path / "out" / "small" / "plots"
-    assert pictures.exists() == ("pictures:" in said)
     assert measured(suite, request) == said
     assert len(read_rows(results)) == len(rows)
-    assert show(suite, ["main", "sweeps"], rows) in said
     # Trained and simulated again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
     weights = {path.stat().st_mtime_ns for path in tmp_path.rglob("best.safetensors")}
     measured(suite, replace(request, again=True))
     again = read_rows(results)
     assert len(again) == len(rows)
-    methods = [row.method for row in again]
-    assert methods == [*4 * ["dt+shared"], "random", "mixture", "optimal", *4 * ["popular"]]
     first, second = (sorted((r.method, str(r.log_seed), r.value) for r in x) for x in (rows, again))
     assert first == second
     written = {path.stat().st_mtime_ns for path in tmp_path.rglob("best.safetensors")}
     assert len(written - weights) == 4
-    seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
-    measured(suite, seeds)
+    measured(suite, replace(request, evaluation_seed=5, log_seed=3, logs=1))
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
-    assert {row.log_seed for row in read_rows(results)} == {None, 0, 1, 3}
     assert last.data_fingerprint != again[-1].data_fingerprint
 
 
@@ -138,14 +123,7 @@ def test_any_gymnasium_environment_is_measured(
     rows = read_rows(tmp_path / "out" / "results.jsonl")
     assert [row.method for row in rows] == ["random", "item-knn", "dt"]
     assert {(row.task, row.environment, row.log_seed) for row in rows[1:]} == {(title, title, 0)}
-    random = next(row for row in rows if row.method == "random")
-    assert random.metrics["length"] == 5
-
-
-def test_sardine_may_be_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
-    budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
-    assert planned(tmp_path, budget).missing() == ["sardine-static"]
+    assert rows[0].metrics["length"] == 5
 
 
 @pytest.mark.usefixtures("no_data")
@@ -158,34 +136,36 @@ def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
     trained = [cell for cells in tables.values() for cell in cells if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
-    assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
     of_pages = {cell.method for cell in trained if cell.task in pages}
     assert not of_pages & {"item-knn", "dt+shared"}
     of_catalog = {cell.method: cell.config for cell in trained if cell.task in catalog}
-    plain, plus = of_catalog["dt"], of_catalog["dt+shared"]
-    assert (plain.policy.exposure, plain.rule.choose) == (False, False)
-    assert (plus.policy.exposure, plus.rule.choose) == (True, True)
+    for name, shared in (("dt", False), ("dt+shared", True)):
+        config = of_catalog[name]
+        assert (config.policy.exposure, config.rule.choose) == (shared, shared)
     swept = {cell.method: cell.config for cell in tables["sweeps"]}
     smallest = swept["ucf, ε_r = 0.02 σ"].augment.epsilon_r
-    store = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
+    store = EpisodeStore.open(trained[0].store)
     rewards = store.step_values("reward", *store.all_steps())
     assert smallest == pytest.approx(0.02 * rewards.std())
     distractors = [cell for cell in tables["distractor"] if cell.task.endswith("distractor")]
-    planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
-    assert planted.observation_size == 92
-    assert [environment.rate for environment in distractors[0].environments] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.evaluation.target_quantile for cell in tables["distractor"]} == {1.0, 0.99}
+    assert EpisodeStore.open(distractors[0].store).observation_size == 92
+    assert [environment.rate for environment in distractors[0].environments] == [0.0, 1.0]
     for cells in tables.values():
         paper = [cell for cell in cells if cell.method == "ucf-paper"]
         assert {cell.task for cell in paper} == {cell.task for cell in cells}
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(tmp_path: Path) -> None:
+def test_a_task_that_is_named_is_measured_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
+    budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
+    assert planned(tmp_path, budget).missing() == ["sardine-static"]
     for task, table in product(("synthetic-catalog", "synthetic-taobao"), ("main", "sweeps")):
-        plan = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
-        assert {cell.task for cell in plan.cells(table)} == {task}
-        assert plan.missing() == []
+        named = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
+        assert {cell.task for cell in named.cells(table)} == {task}
+        assert named.missing() == []
 
 
 @pytest.mark.slow
@@ -205,10 +185,7 @@ def test_screened_methods_have_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert {"screening" in row.details for row in own} == {name in SCREENED}
         assert {row.target_return is None for row in own} == {name == "bc"}
     run = found["ucf-dropped"].run
-    assert run is not None
-    screening = read_record(run).screening
-    assert screening is not None
-    flagged = tuple(screening.flagged)
+    flagged = tuple(read_record(run).screening.flagged)
     assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {flagged}
     assert TrainedPolicy.load(run).record.dropped_observations == flagged
 
@@ -221,8 +198,6 @@ def test_show_only_measures_nothing(tmp_path: Path, capsys: pytest.CaptureFixtur
     append_rows(path, [result_row(10.0), result_row(20.0), result_row(3.0, training_seed=1)])
     assert main(arguments) == 0
     assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
-    assert main([*arguments, "--table", "sweeps"]) == 2
-    assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
     assert main(["benchmark", "recommendation", "--out", "out", "--table", "table-2"]) == 2
     assert "no table is called table-2; there are main, shared, dist" in capsys.readouterr().err
 
@@ -234,7 +209,6 @@ def test_a_given_log_is_dealt_out_by_session() -> None:
     assert not sessions[0] & sessions[1]
     assert sorted(row for part in parts for row in part["row"].to_pylist()) == list(range(1500))
     assert min(map(len, sessions)) > 200
-    assert part_of(log, 0, 1).equals(log)
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
@@ -260,8 +234,7 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
     learned_at, played_at = (s.step_values("timestamp", *s.all_steps()) for s in (learned, played))
     assert learned_at.max() < played_at.min()
     assert learned.lengths.max() <= EXITS["easyrl4rec-kuairand"].max_turn
-    row = evaluate_behavior(task.environments[2], "random", 50, 0)
-    assert row["length"] == 10
+    assert evaluate_behavior(task.environments[2], "random", 50, 0)["length"] == 10
 
 
 @pytest.mark.parametrize(
@@ -270,7 +243,6 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
         ({"methods": ["dt", "nothing"]}, "no method is called nothing"),
         ({"tasks": ["nowhere"]}, "no task is called nowhere"),
         ({"training_seeds": 0}, "0 training seeds are requested"),
-        ({"logs": 0}, "0 logs are requested"),
         ({"budget": "huge"}, "no budget is called huge"),
     ],
 )

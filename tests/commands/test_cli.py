@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from safetensors.numpy import load_file
 
+from tests.support.markdown import ROOT
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
@@ -28,9 +29,10 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.ab_test import compare_arms
 from ucfrec.plugins import load_plugin
 from ucfrec.provenance import provenance
-from ucfrec.results.rows import ResultRow, ResultTable, read_results
+from ucfrec.results.rows import ResultRow, ResultTable, latest, read_results
 from ucfrec.runs.config import settings_given
 from ucfrec.runs.promoted import promote
+from ucfrec.runs.record import verify_run
 from ucfrec.runs.screened import screen_store
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import Search
@@ -180,6 +182,7 @@ def save(table: ResultTable | pd.DataFrame) -> None:
 
 
 STORE, LATER, SHOWN = "synthetic-catalog-store", "later.parquet", "shown.parquet"
+MEASURED = ROOT / "benchmarks" / "results" / "recommendation.jsonl"
 ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
     "prepare": (
         "prepare later.parquet --out out --reward is_click --session-by gap --gap-minutes 7",
@@ -241,8 +244,24 @@ ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
             trials=1,
         ),
     ),
+    "verify": ("verify run", lambda _: verify_run(Path("run"))),
+    "benchmark": (
+        f"benchmark recommendation --show-only --table sweeps --results {MEASURED}",
+        lambda _: print(
+            load_plugin("benchmarks", "recommendation")
+            .tables["sweeps"]
+            .show([row for row in latest(read_results(MEASURED)) if row.table == "sweeps"])
+        ),
+    ),
 }
 """Command line, and what does the same in Python."""
+ELSEWHERE = {
+    "demo": "commands/test_demo.py",
+    "serve": "recommending/test_web.py",
+    "explore": "exploring/test_page.py",
+    "datasets": "datasets/test_movielens.py",
+}
+"""Files of tests that compare other commands with Python."""
 SLOW = ("train", "rank", "update", "export", "tune")
 
 
@@ -287,8 +306,12 @@ def test_a_command_does_what_the_python_api_does(
             pd.testing.assert_frame_equal(content, written[1][name], check_dtype=False)
         else:
             assert content == written[1][name], name
-    if command == "settings":
+    if command in ("settings", "benchmark"):
         assert printed[0] == printed[1]
+
+
+def test_every_command_is_compared_with_python() -> None:
+    assert {*ALIKE, *ELSEWHERE} == {*UCFREC.commands}
 
 
 def _content(path: Path) -> object:

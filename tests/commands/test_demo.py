@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from ucfrec.commands.cli import main
 from ucfrec.commands.demo import (
     BEHAVIORS,
     ENVIRONMENTS,
@@ -26,7 +27,9 @@ TINY = DemoConfig(
 
 
 @pytest.mark.slow
-def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_the_demo_writes_every_row_and_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = demo(tmp_path / "demo", seed=0, config=TINY)
     written = read_results(tmp_path / "demo" / "results.json")
     assert written == rows
@@ -54,6 +57,8 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
             assert f"<summary>{environment}/{name}</summary>" in page
     weights = tmp_path / "demo" / ENVIRONMENTS[0] / "dt" / "policy" / "best.safetensors"
     written_at = weights.stat().st_mtime_ns
-    again = demo(tmp_path / "demo", seed=0, config=TINY)
+    monkeypatch.setattr("ucfrec.commands.demo.FULL", TINY)
+    assert main(["demo", "--full", "--out", str(tmp_path / "demo")]) == 0
+    again = read_results(tmp_path / "demo" / "results.json")
     assert weights.stat().st_mtime_ns == written_at
     assert [row.metrics for row in again] == [row.metrics for row in rows]

@@ -12,6 +12,7 @@ import pytest
 
 import ucfrec_datasets
 from ucfrec import EpisodeStore, Recommender
+from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import prepare
@@ -60,7 +61,9 @@ def official_100k() -> bytes:
     return file.getvalue()
 
 
-def test_one_call_trains_on_the_100k_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_call_trains_on_the_100k_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     content = official_100k()
     release = DATASET.releases["movielens-100k"]
     checksum = f"md5:{hashlib.md5(content).hexdigest()}"
@@ -70,6 +73,8 @@ def test_one_call_trains_on_the_100k_files(tmp_path: Path, monkeypatch: pytest.M
         ucfrec_datasets.load("movielens-100k", tmp_path)
     monkeypatch.setattr(movielens, "DATASET", changed)
     logs = ucfrec_datasets.load("movielens-100k", tmp_path)
+    assert main(["datasets", "movielens-100k", "--folder", str(tmp_path)]) == 0
+    assert f"movielens-100k: {len(logs.files)} log files" in capsys.readouterr().out
     movies = pd.read_csv(logs.files[0].with_name("movies.csv"))
     assert movies.title[2] == "Café 3 (1995)"
     assert movies.genres[2] == f"{GENRES[3]}|{GENRES[5]}"

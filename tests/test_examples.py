@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import tomllib
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -102,12 +101,6 @@ def test_the_shop_logs_the_probabilities_that_it_draws_with(tmp_path: Path) -> N
     products = log["sku"].str[4:].astype(int).to_numpy()
     expected = [shop.propensities(v)[p] for v, p in zip(visitors, products, strict=True)]
     np.testing.assert_allclose(log["propensity"], expected)
-
-
-def test_the_development_extra_can_run_the_notebooks() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    names = {requirement.split(">")[0] for requirement in project["optional-dependencies"]["dev"]}
-    assert {"nbclient", "ipykernel"} <= names
 
 
 SMALL = ("train.steps=40", "policy.dim=16", "policy.context=4", "rule.sessions=4")

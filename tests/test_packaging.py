@@ -96,9 +96,3 @@ def test_every_pin_is_one_that_any_index_may_have() -> None:
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in pins), pins
     names = [line.partition("==")[0].lower() for line in pins]
     assert len(names) == len(set(names)), "a package has one version"
-
-
-def test_the_python_versions_are_said_once() -> None:
-    minors = [int(c.rpartition(".")[2]) for c in PROJECT["classifiers"] if "Python :: 3." in c]
-    assert PROJECT["requires-python"] == f">=3.{minors[0]},<3.{minors[-1] + 1}"
-    assert minors == list(range(minors[0], minors[-1] + 1))

@@ -154,20 +154,6 @@ def test_a_command_interrupted_while_it_starts_prints_one_line(
     assert {path.name for path in tmp_path.iterdir()} <= {"log.csv", "out"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_command_whose_work_is_done_ends_with_its_own_status(number: signal.Signals) -> None:
-    script = """
-import atexit, os, sys
-from ucfrec.__main__ import main
-atexit.register(os.kill, os.getpid(), int(sys.argv.pop()))
-sys.exit(main())
-"""
-    command = [sys.executable, "-c", script, "preview", str(int(number))]
-    end = subprocess.run(command, capture_output=True, text=True)
-    assert end.returncode == 2, end.stderr
-    assert "interrupted" not in end.stderr
-
-
 def test_without_memory_linear_algebra_is_refused() -> None:
     script = """
 import resource

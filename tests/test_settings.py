@@ -1,10 +1,7 @@
 """Tables of settings: they behave as dataclasses, and reject invalid values."""
 
-import contextlib
 import copy
-import gc
 import pickle
-import weakref
 from dataclasses import FrozenInstanceError, asdict, fields, replace
 from typing import Annotated, Literal
 
@@ -120,21 +117,3 @@ def test_fields_are_described_where_they_were_first_explained() -> None:
     assert (listed["shop.width"].meaning, listed["shop.width"].value) == ("Of each.", 0.25)
     assert listed["shop.ovens"].meaning == "In the back."
     assert listed["shop.hours"].allowed == "2 values, each a whole number, or unset"
-
-
-@pytest.mark.parametrize("shelves", [0, 300])
-def test_a_refusal_keeps_nothing_alive(shelves: int) -> None:
-    """Else libraries report objects that were never freed when the program ends."""
-
-    class Held:
-        pass
-
-    def refused() -> "weakref.ref[Held]":
-        held = Held()
-        with contextlib.suppress(SettingError):
-            Bakery(shelves=shelves)
-        return weakref.ref(held)
-
-    left = refused()
-    gc.collect()
-    assert left() is None

@@ -238,19 +238,3 @@ def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_p
     with atomic_folder(tmp_path / "last"):
         pass
     assert not [name for name in names(tmp_path) if name.startswith(".")]
-
-
-def test_a_lock_file_of_a_stranger_says_nothing_but_is_respected(tmp_path: Path) -> None:
-    lock = tmp_path / ".out.ucfrec-lock"
-    lock.write_bytes(b"\xff")
-    with lock_path(tmp_path / "out"):
-        assert b"process" in lock.read_bytes()
-    other = holder("lock", tmp_path / "out")
-    lock.write_bytes(b"\xff" * 5000)
-    with (
-        pytest.raises(InputError, match="is being written by another process; wait"),
-        lock_path(tmp_path / "out"),
-    ):
-        raise AssertionError("the block must not run")
-    other.kill()
-    other.wait()

@@ -101,15 +101,6 @@ def test_a_wrong_value_is_refused_in_one_line_wherever_it_is_given(
     assert str(caught.value).startswith(f"{file}: ")
 
 
-def test_a_combination_names_every_place_it_was_given_in(tmp_path: Path) -> None:
-    file = tmp_path / "run.toml"
-    file.write_text("[policy]\ndim = 30\n")
-    says = f"settings, {file}: policy.heads is 4; it must divide policy.dim, which is 30"
-    with pytest.raises(InputError, match=re.escape(says)):
-        resolve_config("ucf", file, {"policy.heads": 4})
-    assert resolve_config("ucf", file, {"policy.heads": 3}).policy.dim == 30
-
-
 @pytest.mark.parametrize(
     ("given", "says"),
     [

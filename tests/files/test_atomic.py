@@ -149,32 +149,18 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from ucfrec.files.atomic import atomic_folder, atomic_file
-from ucfrec.files.atomic import lock_path
-path = Path(sys.argv[2])
-with {"lock": lock_path, "folder": atomic_folder, "file": atomic_file}[sys.argv[1]](path) as made:
-    if sys.argv[1] == "folder":
-        (made / "half").write_text("written")
-    if sys.argv[1] == "file":
-        made.write_text("half written")
+with {"folder": atomic_folder, "file": atomic_file}[sys.argv[1]](Path(sys.argv[2])) as made:
+    (made / "half" if made.is_dir() else made).write_text("half written")
     print("held", flush=True)
     time.sleep(60)
 """
 
 
-def holder(how: str, path: Path) -> subprocess.Popen[bytes]:
-    """A process that holds the claim on `path` until it is killed."""
-    started = subprocess.Popen([sys.executable, "-c", HOLD, how, path], stdout=subprocess.PIPE)
-    assert started.stdout is not None
-    assert started.stdout.readline() == b"held\n"
-    return started
-
-
 @pytest.mark.parametrize("how", ["folder", "file"])
-def test_the_holder_is_named_and_death_frees_its_claim_and_scratch(
-    tmp_path: Path, how: str
-) -> None:
+def test_the_holder_is_named_and_death_frees_its_claim(tmp_path: Path, how: str) -> None:
     path = tmp_path / "out"
-    other = holder(how, path)
+    other = subprocess.Popen([sys.executable, "-c", HOLD, how, path], stdout=subprocess.PIPE)
+    assert other.stdout.readline() == b"held\n"
     said = rf"out is being trained by process {other.pid} on .+ since \d{{4}}-.+ UTC; wait for it"
     with pytest.raises(InputError, match=said), lock_path(path, "trained"):
         raise AssertionError("the block must not run")

@@ -28,8 +28,8 @@ class Table(nn.Module):
         return self.line(vectors).square().mean()  # type: ignore[no-any-return]
 
 
-def test_gradients_are_those_of_all_rows(tmp_path: Path) -> None:
-    whole = Table()
+def test_gradients_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
+    whole, values = Table(), torch.randn(7)
     whole(ROWS).backward()
 
     def work() -> None:
@@ -41,14 +41,6 @@ def test_gradients_are_those_of_all_rows(tmp_path: Path) -> None:
             for each in (model, whole)
         )
         torch.testing.assert_close(found, expected)
-
-    together(2, work, tmp_path)
-
-
-def test_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
-    values = torch.randn(7)
-
-    def work() -> None:
         own = values[:2] if distributed.leads() else values[2:]
         mean, deviation = distributed.joint_moments(own)
         torch.testing.assert_close(mean, values.mean())

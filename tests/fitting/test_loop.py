@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tests.support import killed_training
+from tests.support.tensors import assert_same_tensors
 from tests.support.together import together
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
@@ -58,13 +59,6 @@ def equal(a: list[Tensor], b: list[Tensor]) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def assert_same_files(found: Path, expected: Path) -> None:
-    for name in ("best.safetensors", "last.safetensors"):
-        one, other = (load_tensors(folder / name)[0] for folder in (found, expected))
-        assert one.keys() == other.keys()
-        assert all(torch.equal(one[key], other[key]) for key in one)
-
-
 @pytest.mark.slow
 def test_killed_training_ends_as_if_left_alone(tmp_path: Path) -> None:
     calm, folder = tmp_path / "calm", tmp_path / "killed"
@@ -75,7 +69,7 @@ def test_killed_training_ends_as_if_left_alone(tmp_path: Path) -> None:
     assert ended["killed"] >= 3
     for key in ("steps", "best_step", "best_validation"):
         assert ended[key] == getattr(calm_fit, key)
-    assert_same_files(folder, calm)
+    assert_same_tensors(folder, calm, "best", "last")
     every = range(killed_training.EVERY, killed_training.STEPS + 1, killed_training.EVERY)
     losses, logged = (read_metrics(each)["validation_loss"] for each in (calm, folder))
     assert [*logged] == [*every]
@@ -215,16 +209,12 @@ def test_speed_and_waiting_are_measured(tmp_path: Path, monkeypatch: pytest.Monk
         seconds += more
         return result
 
+    def loss(batch: Tensor) -> Any:
+        return takes(0.5, squared(module)(batch))
+
     config = LoopConfig(steps=15, batch_size=64, validate_every=5)
-    fitted = fit(
-        module,
-        lambda generator: takes(0.75, draw(generator)),
-        lambda batch: takes(0.5, squared(module)(batch)),
-        config,
-        tmp_path,
-        seed=1,
-        validate=lambda: takes(4, 0.0),  # counts as neither
-    )
+    given = module, lambda generator: takes(0.75, draw(generator)), loss, config, tmp_path
+    fitted = fit(*given, seed=1, validate=lambda: takes(4, 0.0))  # which counts as neither
     assert fitted.seconds == 15 * 1.25 + 3 * 4
     logged = read_metrics(tmp_path)
     assert logged["waiting_for_data"] == dict.fromkeys((5, 10, 15), 0.75 / 1.25)
@@ -339,7 +329,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(tmp_path: Path) -> None
             train(tmp_path / "parts", stop_at=stop)
     resumed, _ = train(tmp_path / "parts")
     assert equal(weights(whole), weights(resumed))
-    assert_same_files(tmp_path / "whole", tmp_path / "parts")
+    assert_same_tensors(tmp_path / "whole", tmp_path / "parts", "best", "last")
 
 
 def test_processes_that_train_together_have_the_same_averages(tmp_path: Path) -> None:

@@ -90,13 +90,9 @@ def test_lines_and_pages_are_short_and_in_the_navigation(page: Page) -> None:
         assert f" {page.name.removeprefix('docs/')}\n" in NAV + "\n"
 
 
-def test_the_settings_reference_has_every_table() -> None:
+def test_every_table_of_settings_and_every_dataset_has_its_section() -> None:
     assert anchors(Page("docs/settings-reference.md").text) >= {*TABLES}
-
-
-def test_every_supported_dataset_has_its_section() -> None:
-    supported = set(PROJECT["entry-points"]["ucfrec.datasets"])
-    assert anchors(Page("docs/datasets.md").text) >= supported
+    assert anchors(Page("docs/datasets.md").text) >= {*PROJECT["entry-points"]["ucfrec.datasets"]}
 
 
 def test_every_simulator_extra_and_metric_is_named() -> None:
@@ -157,14 +153,6 @@ def test_the_page_of_tables_is_what_the_rows_say() -> None:
     assert ran.returncode == 0, ran.stderr
 
 
-def test_the_page_of_tables_rounds_to_three_digits() -> None:
-    page = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
-    cells = " ".join(line for line in page.splitlines() if line.startswith("|"))
-    numbers = re.findall(r"(?<![\w.])\d+\.\d+(?:e[-+]\d+)?", cells)
-    assert len(numbers) > 1000
-    assert [each for each in numbers if len(re.sub(r"^[0.]+|\.", "", each)) > 3] == []
-
-
 def test_the_dockerfile_is_sound() -> None:
     text = (ROOT / "deploy" / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
@@ -208,8 +196,6 @@ def test_the_site_asks_nothing_of_the_network() -> None:
     """What `make docs` built, which fails where a page or a link is missing."""
     pages = list(BUILT.rglob("*.html"))
     assert len(pages) >= len(SITE)
-    loads = re.compile(
-        r"<(?:script|img|iframe)[^>]+src=\"?https?:|<link[^>]+stylesheet[^>]+https?:"
-    )
+    loads = re.compile(r'<(script|img|iframe)[^>]+src="?https?:|<link[^>]+stylesheet[^>]+https?:')
     for page in pages:
         assert not loads.search(page.read_text(encoding="utf-8")), page.name

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import tomllib
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,8 +81,8 @@ def test_the_committed_notebook_has_its_outputs(name: str) -> None:
     assert "/tmp" not in json.dumps(outputs)
 
 
-def test_the_shop_has_the_faults_that_the_pages_name(tmp_path: Path) -> None:
-    make_log(tmp_path / "shop", sessions=400)
+def test_the_shop_has_its_faults_and_logs_its_probabilities(tmp_path: Path) -> None:
+    shop = make_log(tmp_path / "shop", sessions=400)
     log = pd.read_parquet(tmp_path / "shop" / "impressions.parquet")
     assert log["revenue"].isna().mean() > 0.9
     assert log["visitor"].value_counts().index[0] == "bot-1"
@@ -92,22 +91,11 @@ def test_the_shop_has_the_faults_that_the_pages_name(tmp_path: Path) -> None:
     report = validate([tmp_path / "shop" / "impressions.parquet"], mapping, PrepareOptions())
     assert report["dropped"]["duplicate"] > 0
     assert report["dropped"]["null_key"] > 0
-
-
-def test_the_shop_logs_the_probabilities_that_it_draws_with(tmp_path: Path) -> None:
-    shop = make_log(tmp_path / "shop", sessions=400)
-    log = pd.read_parquet(tmp_path / "shop" / "impressions.parquet").dropna(subset=["visitor"])
-    log = log[log["visitor"] != "bot-1"]
+    log = log[log["visitor"].notna() & (log["visitor"] != "bot-1")]
     visitors = log["visitor"].str[1:].astype(int).to_numpy()
     products = log["sku"].str[4:].astype(int).to_numpy()
     expected = [shop.propensities(v)[p] for v, p in zip(visitors, products, strict=True)]
     np.testing.assert_allclose(log["propensity"], expected)
-
-
-def test_the_development_extra_can_run_the_notebooks() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    names = {requirement.split(">")[0] for requirement in project["optional-dependencies"]["dev"]}
-    assert {"nbclient", "ipykernel"} <= names
 
 
 SMALL = ("train.steps=40", "policy.dim=16", "policy.context=4", "rule.sessions=4")

@@ -126,9 +126,7 @@ def test_rooms_of_the_core_import_only_from_rooms_before_them() -> None:
 def test_no_circle_between_rooms_or_modules(package: str) -> None:
     for graph in (rooms_imported(package), modules_imported(package)):
         # The core's `__init__.py` imports lazily what its users name.
-        rooms = {
-            name: others for name, others in graph.items() if name not in (package, "__init__")
-        }
+        rooms = {name: graph[name] for name in graph.keys() - {package, "__init__"}}
         try:
             TopologicalSorter(rooms).prepare()
         except CycleError as error:

@@ -53,15 +53,10 @@ def test_what_is_imported_is_required_or_of_an_extra_that_a_message_names() -> N
             assert distribution in required(PROJECT["dependencies"]) | offered, f"{here}: {name}"
 
 
-@pytest.mark.parametrize("folder", ["datasets", "simulators", "control"])
-def test_sibling_folders_are_not_packages(folder: str) -> None:
-    """They would shadow Hugging Face's `datasets` and python-control's `control`."""
-    assert (ROOT / folder).is_dir()
-    assert not (ROOT / folder / "__init__.py").exists()
-
-
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_are_importable_and_typed(package: str) -> None:
+    # `datasets` and `control` would shadow Hugging Face's and python-control's packages.
+    assert not (PACKAGES[package].parent / "__init__.py").exists()
     assert (PACKAGES[package] / "py.typed").is_file()
     assert (PACKAGES[package] / "__init__.py").is_file()
     module = import_module(package)
@@ -96,9 +91,3 @@ def test_every_pin_is_one_that_any_index_may_have() -> None:
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in pins), pins
     names = [line.partition("==")[0].lower() for line in pins]
     assert len(names) == len(set(names)), "a package has one version"
-
-
-def test_the_python_versions_are_said_once() -> None:
-    minors = [int(c.rpartition(".")[2]) for c in PROJECT["classifiers"] if "Python :: 3." in c]
-    assert PROJECT["requires-python"] == f">=3.{minors[0]},<3.{minors[-1] + 1}"
-    assert minors == list(range(minors[0], minors[-1] + 1))

@@ -18,7 +18,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.support import killed_run
 from tests.support.episodes import random_episodes, write_store
 from tests.support.signals import wait_until_handled
 from ucfrec.episodes.store import EpisodeStore
@@ -154,20 +153,6 @@ def test_a_command_interrupted_while_it_starts_prints_one_line(
     assert {path.name for path in tmp_path.iterdir()} <= {"log.csv", "out"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_command_whose_work_is_done_ends_with_its_own_status(number: signal.Signals) -> None:
-    script = """
-import atexit, os, sys
-from ucfrec.__main__ import main
-atexit.register(os.kill, os.getpid(), int(sys.argv.pop()))
-sys.exit(main())
-"""
-    command = [sys.executable, "-c", script, "preview", str(int(number))]
-    end = subprocess.run(command, capture_output=True, text=True)
-    assert end.returncode == 2, end.stderr
-    assert "interrupted" not in end.stderr
-
-
 def test_without_memory_linear_algebra_is_refused() -> None:
     script = """
 import resource
@@ -187,26 +172,21 @@ except MemoryError as error:
     assert end.stdout == "no 128 MB for linear algebra\n"
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> EpisodeStore:
-    return write_store(tmp_path / "store", random_episodes([6] * 50, items=False))
-
-
 @contextmanager
-def unnoticed() -> Iterator[None]:
+def unnoticed(seed: int = 5) -> Iterator[None]:
     """All three global generators are as they were before."""
 
     def drawn() -> tuple[float, ...]:
         return random.random(), float(np.random.random()), float(torch.rand(()))  # noqa: NPY002
 
-    def seed() -> None:
-        random.seed(5)
-        np.random.seed(5)  # noqa: NPY002
-        torch.manual_seed(5)
+    def start() -> None:
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
 
-    seed()
+    start()
     expected = drawn()
-    seed()
+    start()
     yield
     assert drawn() == expected
 
@@ -225,14 +205,18 @@ def test_the_loop_keeps_the_state_when_it_raises_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ucf", "dt", "edt4rec"])
-def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: str) -> None:
+def test_a_run_neither_moves_the_callers_state_nor_depends_on_it(tmp_path: Path, name: str) -> None:
+    store, weights = write_store(tmp_path / "store", random_episodes([6] * 50, items=False)), []
     quick = {"policy.cql_steps": 3} if name == "edt4rec" else {}
+    quick |= {"augment.copies": 1} if name == "ucf" else {}
     size = {"train.steps": 4, "policy.dim": 16, "policy.context": 3, "crm.epochs": 1, **quick}
     config = resolve_config(name, None, size)
-    with unnoticed():
-        new_policy(store, config)
-        train_run(store, tmp_path / "run", config)
-        TrainedPolicy.load(tmp_path / "run")
+    for seed in (1, 2):
+        with unnoticed(seed):
+            new_policy(store, config)
+            train_run(store, tmp_path / str(seed), config)
+            weights.append(TrainedPolicy.load(tmp_path / str(seed)).policy.state_dict())
+    assert all(torch.equal(tensor, weights[1][key]) for key, tensor in weights[0].items())
 
 
 def test_collecting_and_evaluating(tmp_path: Path) -> None:
@@ -245,20 +229,6 @@ def test_collecting_and_evaluating(tmp_path: Path) -> None:
     with unnoticed():
         evaluate_policy(at, trained, "bc", 20, 0)
         evaluate_behavior(at, "mixture", 20, 0)
-
-
-def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(
-    store: EpisodeStore, tmp_path: Path
-) -> None:
-    settings = [*killed_run.SETTINGS, "augment.copies=1", "train.steps=10", "crm.epochs=1"]
-    config = resolve_config("ucf", None, settings)
-    weights = []
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002
-        train_run(store, tmp_path / str(seed), config)
-        weights.append(TrainedPolicy.load(tmp_path / str(seed)).policy.state_dict())
-    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
 JOB = """

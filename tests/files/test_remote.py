@@ -5,10 +5,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
 import pytest
 
+from tests.support.logs import random_log, write
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -16,17 +15,10 @@ from ucfrec.files.remote import Input, Output, _open, local_paths, uri_or_path
 from ucfrec.logs.mapping import LogMapping, read_mapping
 from ucfrec.logs.prepare import prepare
 
-START = 1_700_000_000_000
 
-
-def write_log(path: Path, seed: int = 0) -> Path:
-    generator = np.random.default_rng(seed)
-    log = pd.DataFrame({"user_id": generator.integers(9, size=200)})
-    log["item_id"] = generator.integers(7, size=200)
-    log["timestamp"] = START + np.arange(200) * 60_000 + seed
-    log["reward"] = generator.integers(2, size=200)
-    log.to_parquet(path)
-    return path
+def write_log(path: Path, later: int = 0) -> Path:
+    log = random_log(200, users=9, items=7)
+    return write(log.assign(timestamp=log.timestamp + later), path)
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +35,8 @@ def bucket() -> Iterator[str]:
         running.start()
         address = f"127.0.0.1:{running.get_host_and_port()[1]}"
         patch.setenv("AWS_ENDPOINT_URL", f"http://{address}")
-        owner = fs.S3FileSystem(
-            endpoint_override=address, scheme="http", allow_bucket_creation=True
-        )
-        owner.create_dir("logs")
+        more = {"scheme": "http", "allow_bucket_creation": True}
+        fs.S3FileSystem(endpoint_override=address, **more).create_dir("logs")
         yield "s3://logs"
         running.stop()
 
@@ -99,8 +89,7 @@ def test_errors_name_the_place_and_write_nothing(
     (tmp_path / "bad.parquet").write_bytes(b"PAR1 nonsense")
     put(tmp_path / "bad.parquet", f"{place}/bad.parquet")
     assert main(["prepare", f"{place}/bad.parquet", "--out", f"{place}/store"]) == 2
-    message = capsys.readouterr().err
-    assert f"{place}/bad.parquet cannot be read" in message
+    assert f"{place}/bad.parquet cannot be read" in capsys.readouterr().err
     assert main(["prepare", f"{place}/none/x.parquet", "--validate"]) == 2
     assert f"{place}/none/x.parquet" in capsys.readouterr().err
     refused(f"{place}/store", r"has no file|cannot be used")
@@ -119,9 +108,7 @@ def test_only_the_command_line_names_places(tmp_path: Path, place: str) -> None:
     with pytest.raises(InputError, match="does not exist"):
         prepare([f"{place}/log.parquet"], LogMapping(), tmp_path / "store")
     mapping = tmp_path / "stranger.toml"
-    mapping.write_text(
-        f'[[item_features]]\nfiles = ["{place}/log.parquet"]\nkey = "item_id"\n', encoding="utf-8"
-    )
+    mapping.write_text(f'[[item_features]]\nfiles = ["{place}/log.parquet"]\nkey = "item_id"\n')
     with pytest.raises(InputError, match="does not exist"):
         prepare([tmp_path / "log.parquet"], read_mapping(mapping), tmp_path / "store")
     assert uri_or_path(Input, Path)("a/b:c//d") == Path("a/b:c//d")

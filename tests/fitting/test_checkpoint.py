@@ -58,11 +58,9 @@ def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Pat
         ('{"step": 1, "loss": ' + "1" * 5000 + "}", "is not JSON"),
         ("[1]", "is not a JSON object"),
         ('{"loss": 1}', "no whole number of 0 or more as 'step'"),
-        ('{"step": -1}', "no whole number"),
         ('{"step": true}', "no whole number"),
         ('{"step": 1' + "0" * 30 + "}", "no whole number"),
         ('{"step": 1, "loss": "low"}', "no number as 'loss'"),
-        ('{"step": 1, "loss": false}', "no number as 'loss'"),
         ('{"step": 1, "loss": 1' + "0" * 400 + "}", "too large a number as 'loss'"),
     ],
 )

@@ -28,8 +28,8 @@ class Table(nn.Module):
         return self.line(vectors).square().mean()  # type: ignore[no-any-return]
 
 
-def test_gradients_are_those_of_all_rows(tmp_path: Path) -> None:
-    whole = Table()
+def test_gradients_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
+    whole, values = Table(), torch.randn(7)
     whole(ROWS).backward()
 
     def work() -> None:
@@ -41,14 +41,6 @@ def test_gradients_are_those_of_all_rows(tmp_path: Path) -> None:
             for each in (model, whole)
         )
         torch.testing.assert_close(found, expected)
-
-    together(2, work, tmp_path)
-
-
-def test_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
-    values = torch.randn(7)
-
-    def work() -> None:
         own = values[:2] if distributed.leads() else values[2:]
         mean, deviation = distributed.joint_moments(own)
         torch.testing.assert_close(mean, values.mean())
@@ -59,7 +51,7 @@ def test_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
     together(2, work, tmp_path)
 
 
-def test_every_window_of_a_batch_is_of_one_process(tmp_path: Path) -> None:
+def test_every_window_is_of_one_process_and_the_leader_goes_first(tmp_path: Path) -> None:
     def work() -> None:
         parts = torch.zeros(11)
         parts[distributed.share(11)] += 1
@@ -67,18 +59,12 @@ def test_every_window_of_a_batch_is_of_one_process(tmp_path: Path) -> None:
         assert (parts == 1).all()
         with pytest.raises(InputError, match=r"train\.batch_size"):
             distributed.share(2)
-
-    together(3, work, tmp_path)
-
-
-def test_the_leader_goes_first(tmp_path: Path) -> None:
-    def work() -> None:
         with distributed.leader_first():
             if distributed.leads():
                 (tmp_path / "written").touch()
             assert (tmp_path / "written").exists()
 
-    together(2, work, tmp_path)
+    together(3, work, tmp_path)
 
 
 def test_alone_nothing_changes() -> None:
@@ -86,8 +72,8 @@ def test_alone_nothing_changes() -> None:
     with distributed.joined(), distributed.leader_first():
         assert (distributed.processes(), distributed.rank(), distributed.leads()) == (1, 0, True)
         assert distributed.share(9) == slice(0, 9)
-        assert torch.equal(distributed.joint_moments(values)[0], values.mean())
-        assert torch.equal(distributed.joint_moments(values)[1], values.std(correction=0))
+        expected = (values.mean(), values.std(correction=0))
+        assert all(map(torch.equal, distributed.joint_moments(values), expected))
         assert distributed.joint_means({"x": 0.3}, 16) == {"x": 0.3}
         distributed.wait()
 

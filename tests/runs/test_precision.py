@@ -63,9 +63,7 @@ SAMPLED = ["policy.sampled_above=1", "policy.sampled_items=8"]
 
 
 @pytest.mark.parametrize(
-    ("policy_name", "more"),
-    [*((policy_name, []) for policy_name in POLICIES), ("ucf", SAMPLED)],
-    ids=[*POLICIES, "sampled"],
+    ("policy_name", "more"), [*((name, []) for name in POLICIES), ("ucf", SAMPLED)]
 )
 def test_gradients_of_every_learner_are_those_of_float32(
     store: EpisodeStore, policy_name: str, more: list[str]

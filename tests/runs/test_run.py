@@ -1,6 +1,5 @@
 """Runs: resumable at any moment, complete in themselves, honest about what they did."""
 
-import json
 import re
 import resource
 import shutil
@@ -13,12 +12,12 @@ import torch
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
 from tests.support.killed import kills
+from tests.support.tensors import assert_same_tensors
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import read_json
-from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import OWN, SharedStages, train_run
@@ -36,10 +35,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     observation, action = rng.normal(size=(n, 4)), rng.uniform(-1, 1, size=(n, 2))
     reward = observation[:, 0] * action[:, 0] + 0.5 * rng.normal(size=n)
     split = np.repeat([0, 1], [120, 30]).astype(np.uint8)
-    path = tmp_path_factory.mktemp("store") / "store"
     columns = {"observation": observation, "action": action, "reward": reward}
-    EpisodeStore.write(path, columns, lengths, {"split": split})
-    return path
+    path = tmp_path_factory.mktemp("store") / "store"
+    return EpisodeStore.write(path, columns, lengths, {"split": split}).path
 
 
 def vectors(path: Path, reward: float | None = None) -> EpisodeStore:
@@ -48,15 +46,6 @@ def vectors(path: Path, reward: float | None = None) -> EpisodeStore:
     columns = {"observation": rng.normal(size=(300, 3)), "action": rng.uniform(size=(300, 2))}
     columns["reward"] = rng.random(300) if reward is None else np.full(300, reward)
     return EpisodeStore.write(path, columns, np.full(60, 5))
-
-
-def assert_same_tensors(found: Path, expected: Path, *names: str) -> None:
-    for name in names:
-        tensors, others = (
-            load_tensors(run / f"{name}.safetensors")[0] for run in (found, expected)
-        )
-        assert tensors.keys() == others.keys()
-        assert all(torch.equal(each, others[key]) for key, each in tensors.items()), name
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +69,6 @@ def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> No
     assert {*augmented.copy_source, *augmented.action_source} <= {*view.episode_ids}
     assert len(augmented.edit_step) > 0
     report = trained.record.augmentation
-    assert report is not None
     assert report.bound == pytest.approx(report.delta + report.epsilon_r)
     assert 0 < report.acceptance <= 1
     mean, _ = view.state_statistics
@@ -91,9 +79,7 @@ def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> No
     assert trained.target_return(0.5) == pytest.approx(np.median(view.returns), rel=1e-5)
 
 
-def test_a_run_that_goes_on_remembers_where_its_store_lies_now(
-    store: Path, left_alone: Path, tmp_path: Path
-) -> None:
+def test_a_moved_store_is_remembered(store: Path, left_alone: Path, tmp_path: Path) -> None:
     shutil.copytree(store, tmp_path / "moved")
     shutil.copytree(left_alone, tmp_path / "run")
     killed_run.train(tmp_path / "moved", tmp_path / "run")
@@ -101,21 +87,6 @@ def test_a_run_that_goes_on_remembers_where_its_store_lies_now(
     assert record.store == str((tmp_path / "moved").resolve())
     assert record.store_from_run == "../moved"
     assert record.policy == before.policy
-
-
-def test_other_actions_alone_on_the_command_line(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = (*killed_run.SETTINGS, "train.steps=4", "augment.actions=2")
-    command = ["train", str(store), "--out", str(tmp_path / "run")]
-    main([*command, *(text for setting in settings for text in ("--set", setting))])
-    printed = capsys.readouterr().out
-    report = json.loads((tmp_path / "run" / "run.json").read_text())["augmentation"]
-    assert f"other actions {report['actions']['copies']:,} augm" in printed
-    assert "acceptance" not in printed
-    assert (report["copies"], report["proposals"]) == (0, 0)
-    assert not (tmp_path / "run" / "csg").exists()
-    assert TrainedPolicy.load(tmp_path / "run").name == "ucf-augmented"
 
 
 @pytest.mark.parametrize("policy_name", ["ucf", "dt4rec", "cdt4rec"])
@@ -128,10 +99,9 @@ def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> No
         *("policy.return_to_go=horizon", "policy.horizon=2", "rule.choose=false"),
     ]
     record = train_run(store, tmp_path / "run", resolve_config(policy_name, None, settings))
-    assert record.augmentation is not None
-    assert record.augmentation.actions is not None
     assert record.augmentation.actions.copies > 10
     assert np.isfinite(record.finished.best_validation)
+    assert not (tmp_path / "run" / "csg").exists()
 
 
 def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: Path) -> None:
@@ -179,9 +149,7 @@ def test_rewards_that_never_vary_are_refused_before_anything_is_written(tmp_path
     assert not (tmp_path / "run" / "crm").exists()
 
 
-def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_checkpoint_that_cannot_be_written_is_an_error(store: Path, tmp_path: Path) -> None:
     """No file may grow past 20 kB here, as on a disk that is full."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     config = resolve_config("dt", None, ["train.steps=10", "policy.dim=64"])

@@ -10,6 +10,7 @@ from tests.support.killed import kills
 from tests.support.later import NEW, later_log, later_mapping
 from tests.support.served import SETTINGS, trained_run
 from tests.support.tagged import ITEMS
+from tests.support.tensors import assert_same_tensors
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -35,9 +36,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None:
     old, record = TrainedPolicy.load(folder / "run"), RunRecord.read(folder / "run2")
     update = record.update
-    assert update is not None
-    assert update.drift is not None
-    assert update.verdict is not None
     assert (update.of, update.run) == ("run", old.fingerprint)
     assert update.appended["new_items"] == update.appended["new_users"] == NEW
     log = later_log(propensity=True)
@@ -52,9 +50,7 @@ def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None
 
 
 def test_the_updated_run_recommends_new_items(folder: Path) -> None:
-    trained = TrainedPolicy.load(folder / "run2")
-    assert trained.item_ids is not None
-    assert trained.item_ids.tolist() == list(range(ITEMS + NEW))
+    assert TrainedPolicy.load(folder / "run2").item_ids.tolist() == list(range(ITEMS + NEW))
     later_log().to_parquet(folder / "histories.parquet")
     arguments = ["recommend", str(folder / "run2"), str(folder / "histories.parquet")]
     out = folder / "out.parquet"
@@ -63,11 +59,9 @@ def test_the_updated_run_recommends_new_items(folder: Path) -> None:
 
 def test_an_update_of_an_update_has_the_settings_of_the_first_run(folder: Path) -> None:
     later_log(seed=2).to_parquet(folder / "next.parquet")
-    mapping = later_mapping(folder)
-    third = update_run(folder / "run2", [folder / "next.parquet"], folder / "run3", mapping=mapping)
+    logs, mapping = [folder / "next.parquet"], later_mapping(folder)
+    third = update_run(folder / "run2", logs, folder / "run3", mapping=mapping)
     second = RunRecord.read(folder / "run2")
-    assert second.update is not None
-    assert third.update is not None
     assert third.update.settings_from_nothing == second.update.settings_from_nothing
     assert third.config == second.config
 
@@ -101,12 +95,9 @@ def test_the_command_says_what_was_read_and_what_is_better(
     assert "the old run's reward model predicts " in said
     assert "verdict " in said
     record = RunRecord.read(tmp_path / "run2")
-    assert record.update is not None
-    assert record.update.verdict is not None
     assert record.update.verdict.steps == 75
-    old = TrainedPolicy.load(folder / "run").rule
-    assert record.rule is not None
-    changed = f"rule changed  {old} → {record.rule.rule}" if record.rule.rule != old else ""
+    old, new = TrainedPolicy.load(folder / "run").rule, record.rule.rule
+    changed = f"rule changed  {old} → {new}" if new != old else ""
     assert changed in said
     assert ("rule changed" in said) == bool(changed)
     assert main([*arguments[:5], "--window", "soon"]) == 2
@@ -159,8 +150,5 @@ def test_an_update_killed_at_any_moment_ends_as_if_left_alone(folder: Path) -> N
     alone, killed = (RunRecord.read(folder / name) for name in ("run2", "killed"))
     assert killed.update == alone.update
     assert killed.rule == alone.rule
-    for name in ("policy/best.safetensors", "refit/policy/best.safetensors"):
-        expected, found = (load_tensors(folder / run / name)[0] for run in ("run2", "killed"))
-        assert expected.keys() == found.keys()
-        assert all(torch.equal(expected[key], found[key]) for key in expected)
+    assert_same_tensors(folder / "killed", folder / "run2", "policy/best", "refit/policy/best")
     assert main(["verify", str(folder / "killed"), str(folder / "killed-store")]) == 0

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.logs.append import append_logs
-from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import (
     compare_runs,
@@ -30,27 +30,28 @@ from ucfrec.updating.verdict import (
 LOGGED_ITEMS = 12
 
 
+def logged(folder: Path, items: Array, propensity: Any, split: tuple[float, ...]) -> EpisodeStore:
+    """Five rows of each user, in which low items are liked."""
+    rows, chance = np.arange(len(items)), np.random.default_rng(1).random(len(items))
+    log = pd.DataFrame({"user_id": rows // 5, "item_id": items, "propensity": propensity})
+    log["timestamp"] = 1_700_000_000_000 + rows * 1000
+    log["reward"] = (chance < 0.8 - 0.06 * items) * 1.0
+    return store_of(log, folder, split=split)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     """A policy of item rates on a log of uniform draws, in which low items are liked."""
-    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("verdict")
-    rows = 4000
-    log = pd.DataFrame(
-        {"user_id": np.arange(rows) // 5, "item_id": rng.integers(LOGGED_ITEMS, size=rows)}
-    )
-    log["timestamp"] = 1_700_000_000_000 + np.arange(rows) * 1000
-    log["reward"] = (rng.random(rows) < 0.8 - 0.06 * log.item_id) * 1.0
-    log["propensity"] = 1 / LOGGED_ITEMS
-    store_of(log, folder, split=(0.6, 0.1, 0.3))
-    Recommender("item-rate").fit(EpisodeStore.open(folder / "store"), folder / "run")
-    return TrainedPolicy.load(folder / "run")
+    folder = tmp_path_factory.mktemp("verdict")
+    items = np.random.default_rng(0).integers(LOGGED_ITEMS, size=4000)
+    store = logged(folder, items, 1 / LOGGED_ITEMS, (0.6, 0.1, 0.3))
+    Recommender("item-rate").fit(store, folder / "run")
+    trained = TrainedPolicy.load(folder / "run")
+    return replace(trained, rule=DecisionRule(trained.rule.target, temperature=0.3))
 
 
-def verdict(
-    new: TrainedPolicy, old: TrainedPolicy, rows: EpisodeStore | None = None
-) -> UpdateVerdict:
-    store = EpisodeStore.open(new.folder.parent / "store")
-    return compare_runs(new, old, rows or store.split("test"), 0)
+def rows_of_test(trained: TrainedPolicy) -> EpisodeStore:
+    return EpisodeStore.open(trained.folder.parent / "store").split("test")
 
 
 def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
@@ -63,25 +64,23 @@ def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
 
 
 def test_a_better_and_a_worse_run_are_told_apart(trained: TrainedPolicy) -> None:
-    rule = DecisionRule(trained.rule.target, temperature=0.3)
-    good = replace(trained, rule=rule)
-    bad = replace(reversed_of(trained), rule=rule)
-    for new, old, result, sign in ((good, bad, "better", 1), (bad, good, "worse", -1)):
-        found = verdict(new, old)
+    bad = reversed_of(trained)
+    for new, old, result, sign in ((trained, bad, "better", 1), (bad, trained, "worse", -1)):
+        found = compare_runs(new, old, rows_of_test(trained), 0)
         assert (found.result, found.decided_by) == (result, "reward per step")
         assert all(each.sign == sign for each in found.differences)
         assert describe(found).count("for" if sign > 0 else "against") >= 2
 
 
 def test_a_run_is_level_with_itself(trained: TrainedPolicy) -> None:
-    found = verdict(trained, trained)
+    found = compare_runs(trained, trained, rows_of_test(trained), 0)
     assert found.result == "no significant difference"
     assert all(each.value == 0 for each in found.differences)
 
 
 def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
     """The test rows with other propensities, or none."""
-    store = EpisodeStore.open(trained.folder.parent / "store").split("test")
+    store = rows_of_test(trained)
     steps = {name: store.column(name) for name in ("item", "reward", "timestamp")}
     if propensities is not None:
         steps["propensity"] = propensities
@@ -90,33 +89,27 @@ def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
 
 
 def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
-    bare = rows_of(trained, None)
-    found = verdict(trained, reversed_of(trained), bare)
+    found = compare_runs(trained, reversed_of(trained), rows_of(trained, None), 0)
     assert (found.result, found.decided_by) == ("better", "ndcg_liked")
     assert len(found.differences) == 1
 
 
 def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
-    steps = EpisodeStore.open(trained.folder.parent / "store").split("test").n_steps
+    steps = rows_of_test(trained).n_steps
     wrong = rows_of(trained, np.full(steps, 5 / LOGGED_ITEMS, dtype=np.float32))
-    rule = DecisionRule(trained.rule.target, temperature=0.3)
-    found = verdict(replace(trained, rule=rule), replace(trained, rule=rule), wrong)
+    found = compare_runs(trained, trained, wrong, 0)
     assert (found.result, found.decided_by) == ("no significant difference", "reward per step")
     assert "where 1 is expected" in found.differences[-1].doubt
     assert "not reliable" in describe(found)
 
 
-def test_what_was_served_without_seen_items_is_compared_without_them(
+def test_seen_items_are_compared_as_they_were_served(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:
     rng, users = np.random.default_rng(0), 400
-    log = pd.DataFrame({"user_id": np.repeat(np.arange(users), 5)})
-    log["item_id"] = np.concatenate([rng.permutation(LOGGED_ITEMS)[:5] for _ in range(users)])
-    log["timestamp"] = 1_700_000_000_000 + np.arange(len(log)) * 1000
-    log["reward"] = (rng.random(len(log)) < 0.8 - 0.06 * log.item_id) * 1.0
-    log["propensity"] = 1 / (LOGGED_ITEMS - log.groupby("user_id").cumcount())
-    store_of(log, tmp_path, split=(0.2, 0.2, 0.6))
-    store = EpisodeStore.open(tmp_path / "store")
+    items = np.concatenate([rng.permutation(LOGGED_ITEMS)[:5] for _ in range(users)])
+    propensity = 1 / (LOGGED_ITEMS - np.tile(np.arange(5), users))
+    store = logged(tmp_path, items, propensity, (0.2, 0.2, 0.6))
     rows, others = store.split("test"), store.split("train")
     uniform = replace(trained, rule=DecisionRule(trained.rule.target, temperature=1e6))
     seen = UserRows.of(rows, rows.episode_values("user"), others)
@@ -126,12 +119,10 @@ def test_what_was_served_without_seen_items_is_compared_without_them(
 
 
 def test_a_difference_among_few_users_is_doubted(trained: TrainedPolicy) -> None:
-    rule = DecisionRule(trained.rule.target, temperature=0.3)
-    good, bad = replace(trained, rule=rule), replace(reversed_of(trained), rule=rule)
-    rows = EpisodeStore.open(trained.folder.parent / "store").split("test")
+    rows = rows_of_test(trained)
     users = rows.episode_values("user")
     few = rows.select(np.flatnonzero(users < np.unique(users)[9]))
-    found = verdict(good, bad, few)
+    found = compare_runs(trained, reversed_of(trained), few, 0)
     assert (found.result, found.users) == ("no significant difference", 9)
     assert all("fewer than 10, have such rows" in each.doubt for each in found.differences)
 

@@ -1,6 +1,5 @@
 """Exposures joined with feedback: every row of feedback counts once, for what it is about."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -160,14 +159,6 @@ def test_what_is_left_out_is_told_in_one_note(tmp_path: Path, name: str) -> None
     assert log.position.tolist() == SHOWN["position"]
     rows = {"other requests": 0, "other users": 0, "a word": 2}
     assert log.feedback.sum() == rows.get(name, 1)
-
-
-def test_a_column_of_text_without_a_value_is_left_out_without_a_note(tmp_path: Path) -> None:
-    parquet = feedback([(1, 10, 7, 1)]).assign(word=pd.array([None], dtype="string"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputNote)
-        report, _ = joined(tmp_path, csv("word,click", ",1", ",1"), parquet)
-    assert report.columns == ("click",)
 
 
 def test_the_command_writes_a_log_that_prepare_reads(

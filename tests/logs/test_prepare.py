@@ -327,14 +327,13 @@ def write_large_log(path: Path, rows: int, users: pa.Array, items: pa.Array) -> 
     for part in range(12):
         generator, n = np.random.default_rng(part), rows // 12
         columns = {
-            "user_id": users.take(pa.array(generator.integers(len(users), size=n))),
-            "item_id": items.take(pa.array(generator.integers(len(items), size=n))),
+            "user_id": users.take(generator.integers(len(users), size=n)),
+            "item_id": items.take(generator.integers(len(items), size=n)),
             "timestamp": START + generator.integers(10**10, size=n),
             "reward": generator.random(n),
         }
-        table = pa.table(columns)
-        size += table.nbytes
-        pq.write_table(table, path / f"{part}.parquet")
+        pq.write_table(pa.table(columns), path / f"{part}.parquet")
+        size += pa.table(columns).nbytes
     return size
 
 

@@ -80,12 +80,11 @@ def twice(name: str) -> Act:
 
     def act(folder: Path) -> None:
         log, file = random_log(), folder / name
-        columns = [*log.columns, "REWARD" if name == "log.csv" else "reward"]
-        log = log.assign(again=1 - log.reward)
         if name.endswith("parquet"):
-            pq.write_table(pa.table([*map(pa.array, log.to_numpy().T)], names=columns), file)
+            columns = [*map(pa.array, log.to_numpy().T)]
+            pq.write_table(pa.table([*columns, columns[0]], names=[*log.columns, "reward"]), file)
         else:
-            log.set_axis(columns, axis=1).to_csv(file, index=False)
+            log.assign(REWARD=1 - log.reward).to_csv(file, index=False)
         validate([file], LogMapping())
 
     return act

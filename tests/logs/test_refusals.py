@@ -29,9 +29,8 @@ def refuse(act: Act, folder: Path, message: str) -> None:
 
 def log_with(name: str = "log.parquet", mapping: LogMapping | None = None, **values: Any) -> Act:
     """`prepare` of a log in which some columns have other values, or are options."""
-    options = {n: values.pop(n) for n in [*values] if n in PrepareOptions.__dataclass_fields__}
-    if "changed_reward" in values:
-        values["reward"] = values.pop("changed_reward")
+    names = values.keys() & {*PrepareOptions.__dataclass_fields__} - {"reward"}
+    options = {name: values.pop(name) for name in names}
 
     def act(folder: Path) -> None:
         log = random_log().assign(propensity=0.5)
@@ -111,7 +110,7 @@ LOGS: dict[str, tuple[Act, str]] = {
         log_with(user_id=0.5),
         r"user_id \(user_id\) is DOUBLE.*BIGINT.*at most 15 digits: others would be rounded",
     ),
-    "text reward": (log_with(changed_reward="much"), r"reward \(reward\) is VARCHAR"),
+    "text reward": (log_with(reward="much"), r"reward \(reward\) is VARCHAR"),
     "seconds": (
         log_with(timestamp=START // 1000 + np.arange(400)),
         r"no row is left \(400 rows: time before 2000.*milliseconds.*--earliest 1990-01-01, or ear",
@@ -124,10 +123,10 @@ LOGS: dict[str, tuple[Act, str]] = {
         log_with(propensity=[0.5] * 390 + [-1] * 9 + [0]),
         r"is not above 0, down to -1, in 10 of 400 rows.*nullif\(propensity, -1\)",
     ),
-    "equal rewards": (log_with(changed_reward=1.0), r"all 400 rewards equal 1.*another reward"),
-    "no finite reward": (log_with(changed_reward=np.nan), r"no row is left .*NaN"),
+    "equal rewards": (log_with(reward=1.0), r"all 400 rewards equal 1.*another reward"),
+    "no finite reward": (log_with(reward=np.nan), r"no row is left .*NaN"),
     "a reward beyond float32": (
-        log_with(changed_reward=[0.0, 1] * 199 + [2e38, -1e13]),
+        log_with(reward=[0.0, 1] * 199 + [2e38, -1e13]),
         r"2 of 400 rewards are beyond ±1e\+12 \(up to 2e\+38\), too large.*divide them",
     ),
     "no session": (log_with(min_steps=1000), r"no session is left: none of the 400 clean rows"),
@@ -200,7 +199,7 @@ LOGS: dict[str, tuple[Act, str]] = {
         "no ISO 8601 time nor milliseconds; say how it is written",
     ),
     "dates in an expression": (
-        log_with("log.csv", made="03/01/2024", reward="month(made)"), "not a scalar SQL expression"
+        log_with("log.csv", LogMapping(reward="month(made)"), made="03/01/2024"), "not a scalar SQL"
     ),
     "a condition that is none": (
         log_with(mapping=LogMapping(where="user_id")),

@@ -42,9 +42,7 @@ def test_an_order_of_day_and_month_that_no_row_settles_can_be_said(
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 @pytest.mark.parametrize("written", ["%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M", "%d-%m-%Y, %H:%M:%S"])
-def test_a_day_beyond_12_anywhere_in_the_file_settles_it(
-    tmp_path: Path, suffix: str, written: str
-) -> None:
+def test_a_day_beyond_12_settles_it(tmp_path: Path, suffix: str, written: str) -> None:
     # The 13th comes after the first 20,000 rows, at which DuckDB looks.
     log = make_log(days("2024-03-01", 13, 24_000).strftime(written))
     path = write(log, tmp_path / f"log{suffix}")

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.support.logs import START, list_users, random_log, store_of
+from tests.support.logs import START, list_users, random_log, store_of, write
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -88,59 +88,39 @@ REFUSED = (
 
 
 @pytest.fixture
-def inputs(tmp_path: Path) -> list[Path]:
-    """Two inputs; beside them, files that are none."""
+def closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[duckdb.DuckDBPyConnection]:
+    """An engine with two inputs; beside them, files that are none."""
     pd.DataFrame({"x": [1, 2]}).to_parquet(tmp_path / "input.parquet")
     (tmp_path / "input.csv").write_text("x\n1\n2\n")
     pd.DataFrame({"x": [SECRET]}).to_parquet(tmp_path / "other.parquet")
     (tmp_path / "secret.csv").write_text(f"x\n{SECRET}\n")
     (tmp_path / "link.parquet").symlink_to(tmp_path / "other.parquet")
-    return [tmp_path / "input.parquet", tmp_path / "input.csv"]
-
-
-@pytest.fixture
-def closed(inputs: list[Path], tmp_path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
-    with engine(inputs, tmp_path) as connection:
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    with engine([tmp_path / "input.parquet", tmp_path / "input.csv"], tmp_path) as connection:
         yield connection
 
 
-def work_of(folder: Path) -> Path:
-    (work,) = (path for path in folder.iterdir() if path.name.endswith(SCRATCH))
-    return work
+def contents(folder: Path) -> dict[Path, bytes]:
+    """All but the content of the scratch folder."""
+    paths = (path for path in folder.rglob("*") if not path.parent.name.endswith(SCRATCH))
+    return {path: path.read_bytes() if path.is_file() else b"" for path in paths}
 
 
 @pytest.mark.parametrize("statement", REFUSED)
 def test_the_environment_is_shut(
-    closed: duckdb.DuckDBPyConnection,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    statement: str,
+    closed: duckdb.DuckDBPyConnection, tmp_path: Path, statement: str
 ) -> None:
-    home = tmp_path / "home"
-    home.mkdir()
-    monkeypatch.setenv("HOME", str(home))
     frame = pd.DataFrame({"x": [SECRET]})
     assert len(frame) == 1
-    work = work_of(tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.glob("*.*") if path.is_file()}
-    names = {
-        "out": tmp_path / "out",
-        "secret": tmp_path / "secret.csv",
-        "input": tmp_path / "input.csv",
-        "folder": tmp_path,
-        "work": work,
-    }
+    (work,) = tmp_path.glob(f"*{SCRATCH}")
+    before = contents(tmp_path)
+    names = {"out": "out", "secret": "secret.csv", "input": "input.csv", "folder": "", "work": work}
+    paths = {name: tmp_path / path for name, path in names.items()}
     with pytest.raises(duckdb.Error) as caught:
-        closed.execute(statement.format(**names)).fetchall()
+        closed.execute(statement.format(**paths)).fetchall()
     assert SECRET not in str(caught.value)
-    now = {path: path.read_bytes() for path in tmp_path.glob("*.*") if path.is_file()}
-    assert now == before
-    assert {path.name for path in tmp_path.iterdir()} == {
-        *(path.name for path in before),
-        work.name,
-        "home",
-    }
-    assert not list(home.iterdir())
+    assert contents(tmp_path) == before
 
 
 NAMES = "[1] b* it's é {1,2} x\\y"
@@ -153,12 +133,10 @@ def test_files_of_any_name_are_read_alone(tmp_path: Path, name: str) -> None:
     frame = pd.DataFrame({"x": [1, 2]})
     for file, values in ((name, frame), ("1.parquet", frame + 5), ("bc.parquet", frame + 5)):
         path = tmp_path / file
-        if file.endswith(".parquet"):
-            values.to_parquet(path)
-        elif file.endswith(".csv"):
-            values.to_csv(path, index=False)
-        else:
+        if file.endswith(".gz"):
             path.write_bytes(gzip.compress(values.to_csv(index=False).encode()))
+        else:
+            write(values, path)
     with engine([tmp_path / name], tmp_path) as connection:
         (table,) = open_tables(connection, [tmp_path / name])
         assert connection.execute(f"FROM {table.sql}").fetchall() == [(1,), (2,)]
@@ -186,11 +164,7 @@ def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     log = random_log(40)
     log.assign(**{hostile: [{hostile: 1.0}] * 40}).to_parquet(tmp_path / "log.parquet")
     quoted = '"' + hostile.replace('"', '""') + '"'
-    for reward in (
-        "reward * 2",
-        f"{quoted}.{quoted} * reward",
-        f"{quoted}[{quote(hostile)}] + reward",
-    ):
+    for reward in (f"{quoted}.{quoted} * reward", f"{quoted}[{quote(hostile)}] + reward"):
         options = PrepareOptions(reward=reward)
         assert validate([tmp_path / "log.parquet"], LogMapping(), options)["steps"] == 40
     assert [path.name for path in tmp_path.iterdir()] == ["log.parquet"]
@@ -205,19 +179,6 @@ def test_every_connection_is_closed_to_the_environment() -> None:
     found = {path.name for path in files if opens.search(path.read_text(encoding="utf-8"))}
     assert found == {"engine.py"}
     assert quote("it's") == "'it''s'"
-
-
-def rewards_of(columns: dict[str, object], reward: str, folder: Path) -> list[float]:
-    """Rewards of rows in order, undefined ones excluded; checks that a frame gives the same."""
-    frame = pd.DataFrame(columns)
-    frame = frame.assign(user_id=1, item_id=2, timestamp=START + np.arange(len(frame)))
-    frame.to_parquet(folder / "log.parquet")
-    (batch,) = read_histories([folder / "log.parquet"], LogMapping(), reward, last=len(frame))
-    found: list[float] = batch.rewards.tolist()
-    if len(found) == len(frame):
-        (batch,) = frame_histories(frame, LogMapping(), reward, last=len(frame))
-        assert batch.rewards.tolist() == found
-    return found
 
 
 OVERFLOWING = {
@@ -237,8 +198,11 @@ OVERFLOWING = {
     ],
 )
 def test_integers_of_any_width_do_not_overflow(kind: str, reward: str, tmp_path: Path) -> None:
-    columns = {"a": np.array([100, 3], dtype=kind), "b": np.array([100, 10], dtype=kind)}
-    assert rewards_of(columns, reward, tmp_path) == OVERFLOWING[reward]
+    log = random_log(2, users=1).assign(a=np.array([100, 3], kind), b=np.array([100, 10], kind))
+    log.to_parquet(tmp_path / "log.parquet")
+    (batch,) = read_histories([tmp_path / "log.parquet"], LogMapping(), reward, last=2)
+    (of_frame,) = frame_histories(log, LogMapping(), reward, last=2)
+    assert batch.rewards.tolist() == of_frame.rewards.tolist() == OVERFLOWING[reward]
 
 
 @pytest.mark.parametrize(
@@ -246,37 +210,27 @@ def test_integers_of_any_width_do_not_overflow(kind: str, reward: str, tmp_path:
     [
         ("x", [0.25, 1.0]),
         ("x > 0.5", [0.0, 1.0]),
-        ("if(x > 0.5, 2, 1)", [1.0, 2.0, 1.0, 1.0]),
         ("coalesce(x, 7)", [0.25, 1.0, 7.0, 7.0]),
-        ("if(isnan(x), 7, x)", [0.25, 1.0, 7.0, 7.0]),
         ("clicks + x", [0.25, 2.0]),
         # Extremes and number of missing values in the file show nothing of NaN.
         ("y > 0.5", [1.0, 1.0, 1.0]),
-        ("y < 5", [1.0, 1.0, 1.0]),
         ("if(y < 5, 1, 2)", [1.0, 1.0, 2.0, 1.0]),
-        ("coalesce(y, 7)", [0.75, 1.0, 7.0, 2.0]),
         ("if(isnan(y), 7, y)", [0.75, 1.0, 7.0, 2.0]),
         ("clicks / views > 0.1", [1.0, 0.0, 1.0]),
         ("coalesce(clicks / views, 7)", [7.0, 0.5, 0.0, 1.5]),
         ("ln(views) > 0.5", [1.0, 0.0, 1.0]),
-        ("ln(views) + ln(views)", [1.3862944, 0.0, 1.3862944]),
         ("least(ln(views), 5)", [0.6931472, 0.0, 0.6931472]),
-        ("greatest(sqrt(clicks - 1), 0)", [0.0, 1.4142135]),
         ("greatest(clicks // views, 1, 2)", [2.0, 2.0, 2.0]),
         ("least(coalesce(nullif(views, 0), 3), 2)", [2.0, 2.0, 1.0, 2.0]),
     ],
 )
-def test_what_is_undefined_is_above_no_threshold(
-    reward: str, wanted: list[float], tmp_path: Path
-) -> None:
+def test_the_undefined_exceeds_nothing(reward: str, wanted: list[float], tmp_path: Path) -> None:
     columns = {
         "x": pa.array([0.25, 1.0, float("nan"), None]),
         "y": pa.array([0.75, 1.0, float("nan"), 2.0], pa.float32()),
-        "clicks": pa.array([0, 1, 0, 3]),
-        "views": pa.array([0, 2, 1, 2]),
-        "user_id": pa.array([1] * 4),
-        "item_id": pa.array([2] * 4),
-        "timestamp": pa.array(START + np.arange(4)),
+        "clicks": [0, 1, 0, 3],
+        "views": [0, 2, 1, 2],
+        **{name: random_log(4, users=1)[name] for name in ("user_id", "item_id", "timestamp")},
     }
     pq.write_table(pa.table(columns), tmp_path / "log.parquet")
     (batch,) = read_histories([tmp_path / "log.parquet"], LogMapping(), reward, last=4)
@@ -304,8 +258,7 @@ def test_undefined_numbers_of_features_are_missing(tmp_path: Path) -> None:
 
 
 def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
-    """A CSV log whose `column` is `first`, in more rows than types are inferred from, then
-    `later`."""
+    """A CSV log with `later` after more rows than types are inferred from."""
     rows = 25_000
     lines = [f"{column},user_id,item_id,timestamp"]
     values = [first] * (rows - 1) + [later]
@@ -323,7 +276,7 @@ def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
         ("2024-01-01 00:00:00", "2024-01-01 12:30:00+02:00", "hour(x::TIMESTAMP)", 10.0),
     ],
 )
-def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
+def test_later_rows_of_csv_are_not_cut(
     tmp_path: Path, first: str, later: str, reward: str, wanted: float
 ) -> None:
     path = csv_of(tmp_path, "x", first, later)
@@ -338,12 +291,9 @@ def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str)
     with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet") as caught:
         list(read_histories([path], LogMapping(), "visit", last=1))
     assert len(str(caught.value)) < 700
-    # What names a session is text, whatever the first rows look like, but not in an expression.
+    # What names a session is text, whatever the first rows look like.
     mapping = LogMapping({"session_id": "visit"})
     assert list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
-    mapping = LogMapping({"session_id": "visit"}, where="visit <> 'bot'")
-    with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet"):
-        list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
 
 
 MAPPING = """
@@ -374,9 +324,9 @@ def plain(frame: pd.DataFrame) -> pd.DataFrame:
     """The same log with the names of the schema."""
     kept = frame[frame.agent != "bot"]
     times = pd.to_datetime(kept["at"], format="%d/%m/%Y %H:%M:%S")
-    ids = {"user_id": kept.uid, "item_id": "i" + kept.sku.astype(str)}
+    columns = {"user_id": kept.uid, "item_id": "i" + kept.sku.astype(str), "timestamp": times}
     rewards = (kept.stars.clip(upper=5) >= 4).astype(float)
-    frame = pd.DataFrame({**ids, "timestamp": times, "propensity": 1 / 12, "reward": rewards})
+    frame = pd.DataFrame({**columns, "propensity": 1 / 12, "reward": rewards})
     return frame.reset_index(drop=True)
 
 
@@ -423,10 +373,9 @@ def test_a_log_with_neither_column_is_refused_with_both_names(
 ) -> None:
     late = pd.read_parquet(folder / "late.parquet").rename(columns={"uid": "who"})
     late.to_parquet(folder / "who.parquet")
-    run, out = str(folder / "run"), str(folder / "no.parquet")
-    assert main(["score", run, str(folder / "who.parquet"), "--out", out]) != 0
-    told = capsys.readouterr().err
-    assert re.search("has neither 'uid'.* nor a column 'user_id'", told)
+    arguments = [str(folder / name) for name in ("run", "who.parquet", "no.parquet")]
+    assert main(["score", *arguments[:2], "--out", arguments[2]]) == 2
+    assert re.search("has neither 'uid'.* nor a column 'user_id'", capsys.readouterr().err)
     with pytest.raises(InputError, match=r"neither 'uid'.*nor a column 'user_id'") as error:
         Recommender.load(folder / "run").recommend(late)
     assert str(error.value).startswith("histories ")
@@ -451,9 +400,7 @@ def test_frames_are_read_as_the_training_log(folder: Path) -> None:
         (random_log().assign(reward=np.nan), "reward is missing"),
     ],
 )
-def test_errors_of_frames_name_the_frame_not_a_scratch_file_or_an_option(
-    frame: pd.DataFrame, said: str
-) -> None:
+def test_errors_of_frames_name_the_frame(frame: pd.DataFrame, said: str) -> None:
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")
         with pytest.raises(InputError) as error:

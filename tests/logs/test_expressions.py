@@ -30,10 +30,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 SECRET = "the content of a file that was not named"
 HONEST = (
-    "is_click",
     "least(play_ms / duration_ms, 5)",
-    "greatest(play_ms // duration_ms, 1, 2)",
-    "least(coalesce(nullif(duration_ms, 0), 2), 5)",
     "ln(1 + play_ms)",
     "-play_ms ** 2 % 7",
     "is_click = 1 AND NOT (play_ms > 5 OR tag IS NULL)",
@@ -47,41 +44,28 @@ HONEST = (
     "tag::TEXT || '!'",
     "play_ms::DECIMAL(10, 2)",
     "play_ms::BIGINT & 255",
-    "tag NOT IN ('a', 'b')",
     "play_ms BETWEEN 0 AND 5 AND is_click IS NOT NULL",
-    "is_click IS DISTINCT FROM 0",
     "tag LIKE 'a%' OR tag NOT ILIKE 'B_'",
     "tag LIKE 'a!%' ESCAPE '!'",
-    "tag ~ '^[a-z]+$'",
     "try_cast(regexp_extract(tag, '([0-9]+)', 1) AS INT)",
-    "lower(trim(tag))",
     "substring(tag FROM 1 FOR 2)",
-    "split_part(tag, ',', 1)",
     "concat_ws('-', left(tag, 8), user_id)",
-    "md5(concat(tag, user_id))",
     "tag = 'it''s; COPY x TO y'",
     "tag = $$a;b$$",
     "epoch_ms(strptime(day, '%Y-%m-%d'))",
     "strptime(day, ['%Y-%m-%d', '%d.%m.%Y'])",
     "day::TIMESTAMPTZ AT TIME ZONE 'UTC'",
     "TIMESTAMP '2024-01-01' + INTERVAL 1 DAY",
-    "clock - INTERVAL '2 hours'",
     "extract(hour FROM clock)",
     "date_diff('second', TIMESTAMP '2024-01-01', clock)",
     "[play_ms, seconds]::FLOAT[]",
-    "[is_click = 1, is_click = 2]::FLOAT[]",
     "numbers[1:2]",
     "list_sum(numbers) / len(numbers)",
-    "list_contains(numbers, 1)",
     "1 IN numbers",
     "feedback.rating * 2",
     "feedback['rating']",
     "json ->> '$.like'",
-    "json_extract(json, '$.like')::INT",
     '"a column, with ""quotes"""',
-    'abs("a column, with ""quotes""")',
-    "isfinite(play_ms / duration_ms)",
-    "sqrt(abs(play_ms)) + pow(2, is_click)",
     # What shops write is not taken for growth.
     "array_to_string(string_split(tag, '|'), ', ')",
     "concat_ws('-', tag, play_ms::VARCHAR, day)",
@@ -150,12 +134,8 @@ def test_honest_expressions_are_values_of_a_log(
 
 
 def test_columns_are_named_once_in_order(connection: duckdb.DuckDBPyConnection) -> None:
-    assert columns_of(connection, 'b + least(a, b.c) * CASE x WHEN 1 THEN "d e" END') == (
-        "b",
-        "a",
-        "x",
-        "d e",
-    )
+    text = 'b + least(a, b.c) * CASE x WHEN 1 THEN "d e" END'
+    assert columns_of(connection, text) == ("b", "a", "x", "d e")
     assert columns_of(connection, "1 + 1") == ()
 
 
@@ -202,19 +182,16 @@ def toml(path: Path, text: str) -> list[str]:
     """Mapping files with the text at every place that takes an expression."""
     value = json.dumps(text)  # is a TOML string, too
     features = '[[item_features]]\nfiles = ["features.parquet"]\n'
-    forms = [
+    forms = (
         f"reward = {value}\n",
         f"[columns]\nuser_id = {value}\n",
         f'{features}key = {value}\ncolumns = ["reward"]\n',
         f'{features}key = "item_id"\ncolumns = [{value}]\n',
         f'{features}key = "item_id"\nfirst_by = {value}\n',
-    ]
-    files = []
+    )
     for number, form in enumerate(forms):
-        file = path / f"mapping{number}.toml"
-        file.write_text(form, encoding="utf-8")
-        files.append(str(file))
-    return files
+        (path / f"mapping{number}.toml").write_text(form, encoding="utf-8")
+    return [str(path / f"mapping{number}.toml") for number in range(len(forms))]
 
 
 def snapshot(folder: Path) -> dict[Path, bytes]:
@@ -233,15 +210,12 @@ def test_no_way_in_lets_an_attack_through(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    outside = tmp_path / "outside"
-    here = tmp_path / "here"
+    outside, here = tmp_path / "outside", tmp_path / "here"
     outside.mkdir()
-    here.mkdir()
+    shutil.copytree(trained, here)
     (outside / "secret.txt").write_text(SECRET)
     text = attack(name, str(outside / "out"), str(outside / "secret.txt"))
-    shutil.copy(trained / "log.parquet", here / "log.parquet")
-    shutil.copy(trained / "log.parquet", here / "features.parquet")
-    shutil.copytree(trained / "run", here / "run")
+    shutil.copy(here / "log.parquet", here / "features.parquet")
     reward_of_run(here / "run", text)
     mappings = toml(here, text)
     monkeypatch.setenv("HOME", str(outside))
@@ -257,14 +231,11 @@ def test_no_way_in_lets_an_attack_through(
         ["score", run, log, "--out", out],
         ["ope", run, log, "--json", out],
     ]
-    # One of the ten ways each.
     way = ways[BY_COMMAND.index(name) % len(ways)]
-    capsys.readouterr()
     assert main(way) == 2, way
     printed = capsys.readouterr()
-    line = printed.err.strip()
-    assert line.isprintable(), line
-    assert len(line) < 1000
+    assert printed.err.strip().isprintable()
+    assert len(printed.err) < 1000
     assert SECRET not in printed.out + printed.err
     assert snapshot(tmp_path) == before
 
@@ -273,26 +244,17 @@ def test_messages_say_where_the_expression_is_and_what_is_allowed(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def told(*arguments: str) -> str:
-        assert main(list(arguments)) == 2
-        return capsys.readouterr().err.strip()
+        assert main(["prepare", log, "--out", out, *arguments]) == 2
+        return capsys.readouterr().err
 
     log, out = str(trained / "log.parquet"), str(tmp_path / "out")
-    shutil.copytree(trained / "run", tmp_path / "run")
-    reward_of_run(tmp_path / "run", "sum(is_click)")
     (tmp_path / "m.toml").write_text('[columns]\nuser_id = "(FROM x)"\n')
-    assert told("prepare", log, "--out", out, "--reward", "read_text('x')") == (
-        "ucfrec prepare: --reward: for the reward: \"read_text('x')\" is not a scalar SQL "
-        f"expression over the columns of {log}: it calls 'read_text'; allowed are columns, "
-        "literals, operators, casts, CASE, and the functions that docs/log-format.md "
-        "lists"
-    )
-    by_column = told("prepare", log, "--out", out, "--column", "user_id=1; SELECT 2")
-    assert "--column: for user_id: '1; SELECT 2' is not a scalar SQL" in by_column
-    by_file = told("prepare", log, "--out", out, "--mapping", str(tmp_path / "m.toml"))
+    message = told("--reward", "read_text('x')")
+    assert "--reward: for the reward: \"read_text('x')\" is not a scalar SQL" in message
+    assert f"over the columns of {log}: it calls 'read_text'; allowed are columns" in message
+    by_file = told("--mapping", str(tmp_path / "m.toml"))
     assert f"{tmp_path / 'm.toml'}: for user_id: '(FROM x)' is not a scalar" in by_file
     assert "it has a subquery" in by_file
-    by_run = told("recommend", str(tmp_path / "run"), log, "--out", out)
-    assert f"{tmp_path / 'run' / 'run.json'}: for the reward: 'sum(is_click)'" in by_run
 
 
 def test_a_store_of_somebody_else_brings_no_program(
@@ -331,16 +293,16 @@ def test_python_is_no_way_in_either(trained: Path, name: str, tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == [tmp_path / "secret.txt"]
 
 
-@pytest.mark.parametrize("value", [3, {"sql": "is_click"}])
-def test_what_is_no_text_is_refused(
+@pytest.mark.parametrize("value", [3, "sum(is_click)"])
+def test_rewards_of_runs_that_are_none_are_refused(
     trained: Path, value: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(trained / "run", tmp_path / "run")
     reward_of_run(tmp_path / "run", value)
-    log = str(trained / "log.parquet")
+    arguments = [str(tmp_path / "run"), str(trained / "log.parquet")]
     for command, to in (("recommend", "--out"), ("score", "--out"), ("ope", "--json")):
-        assert main([command, str(tmp_path / "run"), log, to, str(tmp_path / "x")]) == 2
-        assert "run.json" in capsys.readouterr().err
+        assert main([command, *arguments, to, str(tmp_path / "x")]) == 2
+        assert str(tmp_path / "run" / "run.json") in capsys.readouterr().err
 
 
 def test_listed_functions_only_compute(connection: duckdb.DuckDBPyConnection) -> None:
@@ -377,7 +339,7 @@ WORDS = st.sampled_from([*SQL_WORDS.split(), "\n"])
 
 @settings(max_examples=100)
 @given(text=st.one_of(st.lists(WORDS, max_size=12).map(" ".join), st.text(max_size=40)))
-def test_soup_is_refused_or_is_a_value_of_each_row(
+def test_soup_is_refused_or_a_value_of_each_row(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
     """No other error than InputError, and none of the engine but for values that do not convert."""
@@ -413,10 +375,7 @@ def test_sums_of_honest_parts_are_accepted(
 
 
 def nested(depth: int, template: str) -> str:
-    given = "a"
-    for _ in range(depth):
-        given = template.format(given)
-    return given
+    return template.format(nested(depth - 1, template)) if depth else "a"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from tests.support.logs import START, list_users
+from tests.support.logs import START, list_users, random_log
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
@@ -19,16 +19,15 @@ def make_log(text: bool) -> pd.DataFrame:
     """Users of few and many rows, equal times, and rows that differ in their rewards only."""
     generator = np.random.default_rng(1)
     n = 600
-    log = pd.DataFrame(
-        {
-            "user_id": generator.geometric(0.15, n) * 3,
-            "item_id": generator.integers(9, size=n) * 2,
-            "timestamp": START + generator.integers(200, size=n),
-            "reward": generator.normal(size=n),
-            "session_id": generator.integers(4, size=n),
-            "observation": list(generator.normal(size=(n, 3)).astype("f4")),
-        }
-    )
+    columns = {
+        "user_id": generator.geometric(0.15, n) * 3,
+        "item_id": generator.integers(9, size=n) * 2,
+        "timestamp": START + generator.integers(200, size=n),
+        "reward": generator.normal(size=n),
+        "session_id": generator.integers(4, size=n),
+        "observation": list(generator.normal(size=(n, 3)).astype("f4")),
+    }
+    log = pd.DataFrame(columns)
     if text:
         for name in ("user_id", "item_id", "session_id"):
             log[name] = name[0] + log[name].astype("string")
@@ -65,12 +64,6 @@ def test_logs_without_items_are_refused(tmp_path: Path) -> None:
         list(read_histories([tmp_path / "log.parquet"], LogMapping(), "reward", 7))
 
 
-def plain_log(**changed: object) -> pd.DataFrame:
-    times = START + np.arange(2)
-    given = {"user_id": [1, 2], "item_id": [3, 4], "timestamp": times, "reward": [0.5, 1.0]}
-    return pd.DataFrame(given | changed)
-
-
 @pytest.mark.parametrize(
     ("name", "values", "told"),
     [
@@ -83,7 +76,7 @@ def plain_log(**changed: object) -> pd.DataFrame:
 def test_columns_of_objects_that_arrow_would_change_or_not_take_are_refused(
     name: str, values: list[object], told: str
 ) -> None:
-    frame = plain_log(**{name: pd.Series(values, dtype=object)})
+    frame = random_log(2).assign(**{name: pd.Series(values, dtype=object)})
     with pytest.raises(InputError, match=f"^histories: {name} {told}"):
         list(frame_histories(frame, LogMapping(), "reward", 7))
 
@@ -97,7 +90,7 @@ def test_columns_of_types_that_are_not_read_are_left_out_with_a_note() -> None:
     }
     for name, values in kinds.items():
         column = pd.Series(pd.arrays.ArrowExtensionArray(pa.chunked_array([values])))
-        frame = plain_log(reward=np.array([0.5, 1], np.float16), **{name: column})
+        frame = random_log(2, users=1).assign(**{name: column}, reward=np.array([0.5, 1], "f2"))
         with pytest.warns(InputNote, match=f"column {name} is left out: it is of type"):
             (batch,) = frame_histories(frame, LogMapping(), "reward", 7)
         assert batch.rewards.tolist() == [0.5, 1.0]

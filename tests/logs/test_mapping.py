@@ -37,28 +37,23 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     server.shutdown()
 
 
-def archive(kind: str) -> bytes:
+def archive(kind: str, name: str = "data/log.csv") -> bytes:
     file = io.BytesIO()
     if kind == "zip":
         with zipfile.ZipFile(file, "w") as content:
-            content.writestr("data/log.csv", ROWS)
-    else:
-        with tarfile.open(fileobj=file, mode="w:gz") as tar:
-            member = tarfile.TarInfo("data/log.csv")
-            member.size = len(ROWS)
-            tar.addfile(member, io.BytesIO(ROWS))
+            content.writestr(name, ROWS)
+        return file.getvalue()
+    with tarfile.open(fileobj=file, mode="w:gz") as tar:
+        member = tarfile.TarInfo(name)
+        member.size = len(ROWS)
+        tar.addfile(member, io.BytesIO(ROWS))
     return file.getvalue()
 
 
 def dataset(url: str, content: bytes) -> Dataset:
-    release = Release(
-        url,
-        "https://example.org",
-        "CC0",
-        f"md5:{hashlib.md5(content).hexdigest()}",
-        len(content),
-        {"all": "data", "other": "nowhere"},
-    )
+    checksum = f"md5:{hashlib.md5(content).hexdigest()}"
+    parts = {"all": "data", "other": "nowhere"}
+    release = Release(url, "https://example.org", "CC0", checksum, len(content), parts)
     resolve = lambda paths, given: (log_files(paths), given.over(LogMapping(reward="reward")))  # noqa: E731
     return Dataset("a data set", resolve, {"sample": release})
 
@@ -82,9 +77,7 @@ def test_a_release_is_downloaded_verified_and_unpacked_once(
         load_release("generic", given, "sample", tmp_path / "data", "other")
 
 
-def test_an_archive_with_another_checksum_is_refused(
-    served: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_another_checksum_is_refused(served: tuple[Path, str], tmp_path: Path) -> None:
     folder, address = served
     (folder / "sample.zip").write_bytes(archive("zip") + b"more")
     given = dataset(f"{address}/sample.zip", archive("zip"))
@@ -113,13 +106,10 @@ def test_without_a_network_it_says_how_to_do_it_by_hand(
 
 
 def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
-    file = io.BytesIO()
-    with tarfile.open(fileobj=file, mode="w") as tar:
-        tar.addfile(tarfile.TarInfo("../escaped.csv"))
-    folder = tmp_path / "data"
+    folder, content = tmp_path / "data", archive("tar.gz", "../escaped.csv")
     folder.mkdir()
-    (folder / "sample.tar").write_bytes(file.getvalue())
-    given = dataset("http://127.0.0.1:9/sample.tar", file.getvalue())
+    (folder / "sample.tar.gz").write_bytes(content)
+    given = dataset("http://127.0.0.1:9/sample.tar.gz", content)
     with pytest.raises(tarfile.OutsideDestinationError):
         load_release("generic", given, "sample", folder)
     assert not (tmp_path / "escaped.csv").exists()

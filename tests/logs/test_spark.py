@@ -64,8 +64,9 @@ def test_stores_of_vectors_are_the_same(tmp_path: Path, spark: Any) -> None:
     log["action"] = list(generator.integers(2, size=(300, 2)).astype("f4"))
     log.loc[3, "action"] = None
     log["observation"] = list(generator.normal(size=(300, 3)))
-    log.drop(columns="item").iloc[:100].to_parquet(tmp_path / "a.parquet")
-    log.drop(columns="item").iloc[100:].to_parquet(tmp_path / "b.parquet")
+    log = log.drop(columns="item")
+    log[:100].to_parquet(tmp_path / "a.parquet")
+    log[100:].to_parquet(tmp_path / "b.parquet")
     mapping = LogMapping({k: v for k, v in MAPPING.columns.items() if k != "item_id"})
     assert_equal_stores([tmp_path], tmp_path, mapping, reward="length", session_by="gap")
 

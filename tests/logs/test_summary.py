@@ -3,6 +3,7 @@
 import itertools
 import re
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.logs import summary
-from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 from ucfrec.logs.sessions import Moments
 
@@ -34,9 +35,8 @@ def notes_of(path: Path, mapping: LogMapping | None = None, **options: object) -
     return [str(note.message) for note in notes if note.category is InputNote]
 
 
-@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
-def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path, name: str) -> None:
-    path = write(make_log(), tmp_path / name)
+def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.csv")
     (note,) = notes_of(path, reward="reward + REVENUE")
     assert (
         "(97%) are dropped: the reward reward + REVENUE is null because revenue is, in 3," in note
@@ -46,30 +46,16 @@ def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path, name
     assert not notes_of(path)
 
 
-def test_parts_whose_rewards_are_all_defined_count_as_none(tmp_path: Path) -> None:
-    log = make_log()
-    write(log[:3000], tmp_path / "a.parquet")
-    write(log[3000:].fillna({"revenue": 0}), tmp_path / "b.csv")
-    missing = f"{log.revenue[:3000].isna().sum():,}"
-    (note,) = notes_of(tmp_path, reward="reward + revenue")
-    assert f"is null because revenue is, in {missing} rows" in note
-
-
-@pytest.mark.parametrize("share", [0.25, 0.15])
-@pytest.mark.parametrize("name", ["user_id", "item_id", "timestamp"])
-def test_many_rows_without_a_key_are_told_of_by_column(
-    tmp_path: Path, name: str, share: float
-) -> None:
+@pytest.mark.parametrize("name", ["user_id", "timestamp"])
+def test_many_rows_without_a_key_are_told_of_by_column(tmp_path: Path, name: str) -> None:
     log = make_log()
     log[name] = log[name].astype("Int64")
-    log.loc[log.index[: int(4000 * share)], name] = None
-    notes = notes_of(write(log, tmp_path / "log.parquet"))
-    if share < 0.2:
-        assert not notes
-    else:
-        assert len(notes) == 1
-        assert "1,000 of 4,000 rows (25%) are dropped: user, item" in notes[0]
-        assert f"({name} in 1,000); fill it in, or map another column" in notes[0]
+    log.loc[:599, name] = None
+    assert not notes_of(write(log, tmp_path / "log.parquet"))
+    log.loc[:999, name] = None
+    (note,) = notes_of(write(log, tmp_path / "log.parquet"))
+    assert "1,000 of 4,000 rows (25%) are dropped: user, item" in note
+    assert f"({name} in 1,000); fill it in, or map another column" in note
 
 
 def test_many_times_out_of_range_and_repetitions_are_told_of(tmp_path: Path) -> None:
@@ -83,33 +69,23 @@ def test_many_times_out_of_range_and_repetitions_are_told_of(tmp_path: Path) -> 
     assert "log finer times, or remove the repetitions" in note
 
 
-def with_bots(names: list[int], rows: int) -> pd.DataFrame:
-    bots = [
-        make_log(rows).assign(user_id=name, timestamp=START + 1000 * np.arange(rows))
-        for name in names
-    ]
+def with_bots(names: Iterable[int | str], rows: int) -> pd.DataFrame:
+    times = START + 1000 * np.arange(rows)
+    bots = [make_log(rows).assign(user_id=name, timestamp=times) for name in names]
     return pd.concat([make_log(), *bots], ignore_index=True)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_the_largest_five_bots_are_named(tmp_path: Path, text: bool) -> None:
-    log = with_bots(list(range(1000, 1007)), 300)
-    log = pd.concat([log, with_bots([2000], 500)[4000:]], ignore_index=True)
-    if text:
-        log["user_id"] = "u" + log["user_id"].astype(str)
+def test_the_largest_five_bots_are_named(tmp_path: Path) -> None:
+    log = pd.concat([with_bots(range(1000, 1007), 300), with_bots([2000], 500)[4000:]])
     path = write(log, tmp_path / "log.parquet")
     (note,) = notes_of(path)
-    name = "u2000" if text else "2000"
-    assert f"{name} (500 rows), " in note
+    assert "2000 (500 rows), " in note
     assert note.count("(300 rows)") == 4
     assert "the median session has 1 row, " in note
-    assert (
-        f'--where "user_id NOT IN ({name!r}, ' in note or '--where "user_id NOT IN (2000, ' in note
-    )
+    assert '--where "user_id NOT IN (2000, ' in note
     assert not notes_of(path, max_session=100)
-    where = "user_id NOT LIKE 'u%000' AND user_id < 'u1'" if text else "USER_ID < 1000"
-    report = validate([path], LogMapping(where=where))
-    assert report["dropped"]["left_out"] == len(log) - report["steps"] > 2500
+    report = validate([path], LogMapping(where="USER_ID < 1000"))
+    assert report["dropped"]["left_out"] == len(log) - report["steps"] == 2600
 
 
 @pytest.mark.parametrize("bot", ["bot-1", "it's", "$(id)", "`id`", 7000])
@@ -126,29 +102,19 @@ def test_the_condition_that_excludes_bots_can_be_pasted(tmp_path: Path, bot: str
         assert report["dropped"]["left_out"] == 300
 
 
-def test_ninety_nine_times_the_median_is_no_bot(tmp_path: Path) -> None:
-    assert not notes_of(write(with_bots([1000], 100), tmp_path / "log.parquet"))
-    assert notes_of(write(with_bots([1000], 101), tmp_path / "log.parquet"))
-
-
 def test_long_sessions_are_left_out_and_counted(tmp_path: Path) -> None:
     path = write(with_bots([1000, 1001], 400), tmp_path / "log.parquet")
     options = PrepareOptions(max_session=399, session_by="user")
     report = prepare([path], LogMapping(), tmp_path / "store", options)
     assert report["dropped"]["long_session"] == 800
     assert (report["steps"], report["users"]) == (4000, 400)
-    report = validate([path], LogMapping(), PrepareOptions(max_session=5, min_steps=2))
-    dropped = report["dropped"]
-    assert dropped["long_session"] >= 800
-    assert report["steps"] + dropped["long_session"] + dropped["short_episode"] == 4800
 
 
-@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
-def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path, name: str) -> None:
+def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path) -> None:
     log = make_log(200).assign(member=[None, "M1", "M9", "M2"] * 50)
-    path, where = write(log, tmp_path / name), "member <> 'M9'"
+    path, where = write(log, tmp_path / "log.csv"), "member <> 'M9'"
     (note,) = notes_of(path, LogMapping(where=where))
-    assert f"{name}: the condition {where} is neither true nor false in 50 of 200 rows" in note
+    assert f"the condition {where} is neither true nor false in 50 of 200 rows" in note
     assert "IS DISTINCT FROM" in note
     for defined in ("member IS DISTINCT FROM 'M9'", f"coalesce({where}, true)"):
         assert not notes_of(path, LogMapping(where=defined))
@@ -160,31 +126,24 @@ def test_a_log_of_a_single_item_is_told_of(tmp_path: Path) -> None:
     assert "all 200 rows show the same item, so there is nothing to choose between" in note
 
 
-@pytest.mark.parametrize(
-    ("split", "empty"),
-    [("2030-01-01,2030-01-02", "validation and test"), ("2023-11-16,2023-11-16", "validation")],
-)
-def test_a_split_that_leaves_a_part_without_rows_is_told_of(
-    tmp_path: Path, split: str, empty: str
-) -> None:
+def test_a_split_that_leaves_a_part_without_rows_is_told_of(tmp_path: Path) -> None:
     path = write(make_log(), tmp_path / "log.parquet")
-    (note,) = notes_of(path, split=parse_split(split))
-    assert f"--split {split[:10]} 00:00:00," in note
-    assert f"leaves no rows for {empty}: the rows are from 2023-11-14 22:13:20 to" in note
+    (note,) = notes_of(path, split=parse_split("2030-01-01,2030-01-02"))
+    assert "--split 2030-01-01 00:00:00," in note
+    assert "leaves no rows for validation and test: the rows are from 2023-11-14 22:13:20" in note
     assert not notes_of(path, split=parse_split("2023-11-16,2023-11-17"))
     assert not notes_of(path, split=(0.8, 0.2, 0.0))
 
 
 @pytest.mark.parametrize(
-    ("kind", "place"),
-    [("int", "position"), ("date", "to_milliseconds(position)"), ("zone", "to_milliseconds(pos")],
+    ("kind", "place"), [("int", "position"), ("zone", "to_milliseconds(position)")]
 )
 def test_the_remedy_for_rows_of_one_page_works(tmp_path: Path, kind: str, place: str) -> None:
     log = make_log().rename(columns={"timestamp": "shown_at"})
     log["position"], log["user_id"] = np.arange(4000) % 4, np.arange(4000) // 4
     log["shown_at"] = START + 200_000 * (np.arange(4000) // 4)
     if kind != "int":
-        log["shown_at"] = pd.to_datetime(log.shown_at, unit="ms", utc=kind == "zone")
+        log["shown_at"] = pd.to_datetime(log.shown_at, unit="ms", utc=True)
     path = write(log, tmp_path / "log.parquet")
     (note,) = notes_of(path, LogMapping({"timestamp": "shown_at"}))
     remedies = re.findall(r'--column "timestamp=(.*?)"', note)
@@ -203,19 +162,17 @@ def test_batches_give_the_moments_of_all() -> None:
     np.testing.assert_allclose(moments.covariance, np.cov(values, ddof=0), rtol=1e-6)
 
 
-def prepared(tmp_path: Path, rewards: Array, mapping: LogMapping | None = None) -> EpisodeStore:
+def prepared(tmp_path: Path, rewards: Array) -> EpisodeStore:
     """A store of sessions of several lengths, with items of several popularities."""
-    generator = np.random.default_rng(0)
-    rows = len(rewards)
-    log = pd.DataFrame(
-        {
-            "user_id": np.sort(generator.geometric(0.05, rows)),
-            "item_id": generator.geometric(0.2, rows),
-            "timestamp": START + np.arange(rows) * 1000,
-            "reward": rewards,
-        }
-    ).sample(frac=1, random_state=1)
-    return store_of(log, tmp_path, mapping or LogMapping(), split=(1.0, 0.0, 0.0), embedding_size=2)
+    generator, rows = np.random.default_rng(0), len(rewards)
+    columns = {
+        "user_id": np.sort(generator.geometric(0.05, rows)),
+        "item_id": generator.geometric(0.2, rows),
+        "timestamp": START + np.arange(rows) * 1000,
+        "reward": rewards,
+    }
+    log = pd.DataFrame(columns).sample(frac=1, random_state=1)
+    return store_of(log, tmp_path, split=(1.0, 0.0, 0.0), embedding_size=2)
 
 
 def counted(values: Array, found: dict[str, Any]) -> None:
@@ -238,17 +195,6 @@ def test_lengths_popularity_and_few_rewards(tmp_path: Path) -> None:
     counted(np.bincount(items), summary["item_popularity"])
     assert [*summary["rewards"]["values"]] == [0, 0.5, 1]
     assert [*summary["rewards"]["counts"]] == np.bincount((rewards * 2).astype(int)).tolist()
-
-
-def test_items_that_were_never_shown_are_counted(tmp_path: Path) -> None:
-    pd.DataFrame({"item_id": range(1, 301), "price": 1.5}).to_csv(tmp_path / "f.csv", index=False)
-    features = (FeatureTable((tmp_path / "f.csv",), "item_id"),)
-    store = prepared(tmp_path, np.arange(400) % 2, LogMapping(item_features=features))
-    popularity = store.record.source.model_dump()["summary"]["item_popularity"]
-    shown = len(np.unique(store.step_values(schema.ITEM, *store.all_steps())))
-    assert popularity["edges"][:2] == (0, 1)
-    assert popularity["counts"][0] == 300 - shown
-    assert sum(popularity["counts"]) == 300
 
 
 def test_many_rewards_fall_into_equal_bins_and_none_is_lost(

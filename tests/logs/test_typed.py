@@ -28,13 +28,7 @@ def range_of(path: Path, mapping: LogMapping | None = None) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "sign", "clock"),
-    [
-        (".csv", "/", ""),
-        (".parquet", ".", " %H:%M"),
-        (".csv", "/", ", %H:%M:%S"),
-        (".parquet", "-", " %I:%M:%S %p"),
-    ],
+    ("suffix", "sign", "clock"), [(".csv", "/", ""), (".parquet", "-", " %I:%M:%S %p")]
 )
 def test_an_order_of_day_and_month_that_no_row_settles_can_be_said(
     tmp_path: Path, suffix: str, sign: str, clock: str
@@ -48,13 +42,10 @@ def test_an_order_of_day_and_month_that_no_row_settles_can_be_said(
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 @pytest.mark.parametrize("written", ["%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M", "%d-%m-%Y, %H:%M:%S"])
-def test_a_day_beyond_12_anywhere_in_the_file_settles_it(
-    tmp_path: Path, suffix: str, written: str
-) -> None:
+def test_a_day_beyond_12_settles_it(tmp_path: Path, suffix: str, written: str) -> None:
     # The 13th comes after the first 20,000 rows, at which DuckDB looks.
-    path = write(
-        make_log(days("2024-03-01", 13, 24_000).strftime(written)), tmp_path / f"log{suffix}"
-    )
+    log = make_log(days("2024-03-01", 13, 24_000).strftime(written))
+    path = write(log, tmp_path / f"log{suffix}")
     assert range_of(path) == ["2024-03-01", "2024-03-13"]
 
 
@@ -72,15 +63,10 @@ def test_a_file_without_dates_needs_no_order(tmp_path: Path, other: str | None) 
     ("written", "expected"),
     [
         ("2024-05-01T10:00:00+02:00", "2024-05-01 08:00:00"),
-        ("2024-05-01T10:00:00.250Z", "2024-05-01 10:00:00.250"),
-        ("2024-05-01T10:00:00", "2024-05-01 10:00:00"),
-        ("2024-05-01 10:00", "2024-05-01 10:00:00"),
         ("2024-05-01", "2024-05-01 00:00:00"),
         ("2024/05/01 10:00:00", "2024-05-01 10:00:00"),
         ("2024-05-01T10:00:00,5-0330", "2024-05-01 13:30:00.500"),
-        ("2024-05-01 10:00:00 +0200", "2024-05-01 08:00:00"),
         ("2024/05/01 10:00 -03:30", "2024-05-01 13:30:00"),
-        ("2024-05-01 10:00:00 Z", "2024-05-01 10:00:00"),
         ("2024-05-01 10:00:00UTC", "2024-05-01 10:00:00"),
         ("1714557600000", "2024-05-01 10:00:00"),
     ],
@@ -102,9 +88,6 @@ def test_iso_times_are_read_with_and_without_zone(
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_other_text_and_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
     times = days("2024-03-01", 11).strftime("%d %b %Y %H:%M")
-    path = write(make_log(times), tmp_path / f"log{suffix}")
-    mapping = LogMapping(time_format="%d %b %Y %H:%M")
-    assert range_of(path, mapping) == ["2024-03-01", "2024-03-11"]
     zoned = write(make_log(times + " +0200"), tmp_path / f"zoned{suffix}")
     mapping = LogMapping(time_format="%d %b %Y %H:%M %z")
     assert range_of(zoned, mapping) == ["2024-02-29", "2024-03-11"]
@@ -116,8 +99,6 @@ def test_other_text_and_whole_numbers_are_read_by_their_format(tmp_path: Path, s
 def test_times_before_2000_are_read_when_asked_for(tmp_path: Path) -> None:
     path = write(make_log(days("1997-09-01", 200)), tmp_path / "log.parquet")
     expected = ["1997-09-01", "1998-03-19"]
-    assert range_of(path, LogMapping(earliest="1990-01-01")) == expected
-    (tmp_path / "m.toml").write_text('earliest = "1997-09-01T00:00:00+00:00"\n')
-    assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected
+    assert range_of(path, LogMapping(earliest="1997-09-01T00:00:00+00:00")) == expected
     (tmp_path / "m.toml").write_text('earliest = "1990-01-01"\ntime_format = "%Y"\n')
     assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected

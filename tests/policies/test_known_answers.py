@@ -44,11 +44,9 @@ def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeSto
     hit = rng.random(SESSIONS * STEPS) < 0.5
     played = random if noise else np.where(hit, kinds.repeat(STEPS), random)
     pays = rng.integers(2, size=len(played)) if noise else played == kinds.repeat(STEPS)
-    columns = {"reward": pays, "observation": observed}
-    if items:
-        columns["item"] = played
-    else:
-        columns["action"] = DIRECTIONS[played] + 0.05 * rng.normal(size=(len(played), 2))
+    noisy = DIRECTIONS[played] + 0.05 * rng.normal(size=(len(played), 2))
+    own = {"item": played} if items else {"action": noisy}
+    columns = {"reward": pays, "observation": observed} | own
     EpisodeStore.write(folder, columns, np.full(SESSIONS, STEPS))
     if items:
         ItemStates(torch.eye(KINDS), torch.zeros(0, 0), 0.0, 1.0).save(folder / ITEM_STATES)

@@ -31,11 +31,9 @@ def test_a_long_store_keeps_its_digits() -> None:
     np.testing.assert_allclose(got, suffixes, rtol=2e-7)
 
 
-gammas = st.sampled_from([0.25, 0.5, 0.75, 1.0])
-definitions = st.one_of(
-    st.just(ReturnToGo()),
-    gammas.map(lambda gamma: ReturnToGo("discounted", discount=gamma)),
-    st.integers(1, 12).map(lambda steps: ReturnToGo("horizon", horizon=steps)),
+definitions = st.sampled_from(
+    [ReturnToGo(), *(ReturnToGo("discounted", gamma) for gamma in (0.25, 0.5, 0.75, 1.0))]
+    + [ReturnToGo("horizon", horizon=steps) for steps in range(1, 13)]
 )
 
 

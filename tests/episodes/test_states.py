@@ -156,6 +156,3 @@ def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError, match=r"item_states\.safetensors is damaged"):
         EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)
-    path.unlink()
-    with pytest.raises(InputError, match=r"item_states\.safetensors does not exist"):
-        EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)

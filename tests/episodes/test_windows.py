@@ -68,18 +68,16 @@ def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
             assert sessions.shown.items[2, :3].tolist() == items[30:27:-1].tolist()
 
 
-definitions = st.one_of(
-    st.just(ReturnToGo()),
-    st.sampled_from([0.25, 0.5, 1.0]).map(lambda gamma: ReturnToGo("discounted", gamma)),
-    st.integers(1, 5).map(lambda steps: ReturnToGo("horizon", horizon=steps)),
+definitions = st.sampled_from(
+    [ReturnToGo(), *(ReturnToGo("discounted", gamma) for gamma in (0.25, 0.5, 1.0))]
+    + [ReturnToGo("horizon", horizon=steps) for steps in range(1, 6)]
 )
 
 
 def make_store(
     folder: Path | str, items: bool = True, lengths: Sequence[int] = LENGTHS
 ) -> EpisodeStore:
-    states = some_states() if items else None
-    episodes = random_episodes([*lengths], items=items)
+    states, episodes = some_states() if items else None, random_episodes([*lengths], items=items)
     return write_store(Path(folder) / "store", episodes, states, shard_steps=6)
 
 

@@ -43,7 +43,7 @@ class Echo(gymnasium.Env[Any, Any]):
         return {"step": self._step, "secret": np.full((2, 1), self._secret), "notes": (1, 2)}
 
     def _info(self) -> dict[str, Any]:
-        info: dict[str, Any] = {"shape that changes": np.zeros(self._step)}
+        info = {"shape that changes": np.zeros(self._step)}
         return info if self._users is None else info | {"user_id": self._users}
 
     def reset(

@@ -121,7 +121,7 @@ def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
 def test_exposure_reaches_as_far_as_the_context() -> None:
     for context, window, lags in ((K, 3, 3), (K, 10, K - 1), (1, 10, 0)):
         policy = build("dt", TAGGED, exposure=True, exposure_window=window, context=context)
-        term = policy.head.exposure  # type: ignore[union-attr]
+        term = policy.head.exposure
         assert (0 if term is None else term.lags) == lags
     with pytest.raises(InputError, match=r"policy\.exposure_window is 0"):
         build("dt", TAGGED, exposure=True, exposure_window=0)

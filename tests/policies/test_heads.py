@@ -133,10 +133,9 @@ def exposed_head(tags: bool) -> ItemHead:
 
 
 def shown_before(m: int) -> Exposed:
-    generator = torch.Generator().manual_seed(9)
-    items = torch.randint(-1, N // 2, (m, LAGS), generator=generator)
-    returns = 2 * torch.rand(m, generator=generator)
-    return Exposed(items, torch.rand(m, LAGS, generator=generator), returns)
+    torch.manual_seed(9)
+    items = torch.randint(-1, N // 2, (m, LAGS))
+    return Exposed(items, torch.rand(m, LAGS), 2 * torch.rand(m))
 
 
 @pytest.mark.parametrize("tags", [True, False])

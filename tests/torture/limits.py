@@ -20,8 +20,7 @@ _BY_A_LIBRARY = (127, -signal.SIGABRT, -signal.SIGSEGV)
 
 def limits(inputs: Inputs, folder: Path) -> Counter[str]:
     """Every command on a read-only and a full disk, without rights, room or memory."""
-    counts = Counter[str]()
-    place = folder / "limits"
+    counts, place = Counter[str](), folder / "limits"
     place.mkdir()
     (place / "file").write_text("")
     for job in inputs.jobs():
@@ -134,8 +133,7 @@ def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
 
 def hostile_parquet(folder: Path) -> Counter[str]:
     """Parquet files that unfold, nest, or carry what no log has."""
-    counts = Counter[str]()
-    place = folder / "hostile"
+    counts, place = Counter[str](), folder / "hostile"
     place.mkdir()
     Running(lambda: _write_hostile(place)).wait()
     for path in sorted(place.glob("*.parquet")):

@@ -1,6 +1,7 @@
 """Terms added to logits by what was shown lately: against loops, and what they must not see."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -54,9 +55,7 @@ def exposed(steps: int, seed: int) -> Exposed:
     return Exposed(items, rewards, 2 * torch.randn(steps, generator=generator))
 
 
-def weights_by_hand(
-    made: ExposureTerm, returns: float, rewards: list[float]
-) -> tuple[list[float], list[float]]:
+def weights_by_hand(made: ExposureTerm, returns: float, rewards: list[float]) -> list[list[float]]:
     """Weights of repetition and of likeness by lag, from the documentation of `ExposureTerm`."""
     knots = made.knots.tolist()
     table = 10 * (made.common + made.by_lag).detach().double()
@@ -65,9 +64,7 @@ def weights_by_hand(
     share = (at - knots[right - 1]) / (knots[right] - knots[right - 1])
     found = (1 - share) * table[:, right - 1] + share * table[:, right]
     liked = [min(max((reward - LOW) / (HIGH - LOW), 0.0), 1.0) for reward in rewards]
-    repeated = [float(found[0, n] + found[1, n] * liked[n]) for n in range(LAGS)]
-    likeness = [float(found[2, n] + found[3, n] * liked[n]) for n in range(LAGS)]
-    return repeated, likeness
+    return [[float(found[i, n] + found[i + 1, n] * liked[n]) for n in range(LAGS)] for i in (0, 2)]
 
 
 def alike(states: ItemStates, one: int, other: int) -> float:
@@ -82,14 +79,11 @@ def alike(states: ItemStates, one: int, other: int) -> float:
 def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
     """The terms added to all logits, one at a time."""
     added = torch.zeros(len(shown.items), ITEMS, dtype=torch.float64)
-    for row, (items, rewards, returns) in enumerate(
-        zip(shown.items.tolist(), shown.rewards.tolist(), shown.returns.tolist(), strict=True)
-    ):
+    given = (values.tolist() for values in vars(shown).values())
+    for row, (items, rewards, returns) in enumerate(zip(*given, strict=True)):
         repeated, likeness = weights_by_hand(made, returns, rewards)
-        for lag, item in enumerate(items):
-            if item < 0:
-                continue
-            for other in range(ITEMS):
+        for (lag, item), other in product(enumerate(items), range(ITEMS)):
+            if item >= 0:
                 added[row, other] += likeness[lag] * alike(states, other, item)
                 added[row, other] += repeated[lag] * (other == item)
     return added.float()
@@ -115,9 +109,7 @@ def test_additions_are_those_of_loops_over_items_and_lags(kind: str, seed: int) 
 
 
 @pytest.mark.parametrize("kind", ["tags", "embeddings"])
-def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_catalogue_is_sparse(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made, shown = term(kind, 3), exposed(20, 3)
     dense = added(made, shown)
     assert kind == "embeddings" or not made.likeness._tag_matrix().is_sparse
@@ -171,15 +163,12 @@ def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
     found = Exposed.before(given_windows, lags)
     assert found.items.shape == found.rewards.shape == (B * K, lags)
     torch.testing.assert_close(found.returns.view(B, K), given_windows.returns_to_go)
-    for b in range(B):
-        for t in range(K):
-            for lag in range(1, lags + 1):
-                there = t - lag >= 0 and bool(given_windows.mask[b, t - lag])
-                expected = int(given_windows.actions[b, t - lag]) if there else -1
-                assert int(found.items.view(B, K, lags)[b, t, lag - 1]) == expected
-                if there:
-                    reward = found.rewards.view(B, K, lags)[b, t, lag - 1]
-                    assert reward == given_windows.rewards[b, t - lag]
+    for b, t, lag in product(range(B), range(K), range(1, lags + 1)):
+        there = t - lag >= 0 and bool(given_windows.mask[b, t - lag])
+        expected = int(given_windows.actions[b, t - lag]) if there else -1
+        assert found.items.view(B, K, lags)[b, t, lag - 1] == expected
+        reward = found.rewards.view(B, K, lags)[b, t, lag - 1]
+        assert not there or reward == given_windows.rewards[b, t - lag]
     chosen, rows = Exposed.before(given_windows, lags, given_windows.mask), given_windows.mask
     for name, values in vars(chosen).items():
         assert torch.equal(values, getattr(found, name)[rows.flatten()])
@@ -203,14 +192,3 @@ def test_a_term_read_back_is_the_one_saved() -> None:
 def test_quantiles_are_numpys_to_the_last_bit(values: list[float], levels: list[float]) -> None:
     found = quantiles(np.array(values, dtype=np.float32), np.array(levels))
     np.testing.assert_array_equal(found, np.quantile(np.array(values), levels))
-
-
-@pytest.mark.parametrize("kind", ["tags", "embeddings"])
-def test_additions_are_float32_whatever_the_network_computes_in(kind: str) -> None:
-    made, shown = term(kind, 1), exposed(5, 2)
-    logits = torch.zeros(5, ITEMS)
-    expected = made.added_to(logits.clone(), shown)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = made.added_to(logits.clone(), shown)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found, expected, rtol=0.02, atol=0.01)

@@ -31,11 +31,9 @@ def test_a_long_store_keeps_its_digits() -> None:
     np.testing.assert_allclose(got, suffixes, rtol=2e-7)
 
 
-gammas = st.sampled_from([0.25, 0.5, 0.75, 1.0])
-definitions = st.one_of(
-    st.just(ReturnToGo()),
-    gammas.map(lambda gamma: ReturnToGo("discounted", discount=gamma)),
-    st.integers(1, 12).map(lambda steps: ReturnToGo("horizon", horizon=steps)),
+definitions = st.sampled_from(
+    [ReturnToGo(), *(ReturnToGo("discounted", gamma) for gamma in (0.25, 0.5, 0.75, 1.0))]
+    + [ReturnToGo("horizon", horizon=steps) for steps in range(1, 13)]
 )
 
 
@@ -61,18 +59,12 @@ def test_every_definition_equals_brute_force(
     np.testing.assert_allclose(got, expected, *((0, 0) if exact else (1e-6, 1e-6)))
 
 
-def test_no_episodes_have_no_returns() -> None:
-    for definition in (ReturnToGo(), ReturnToGo("discounted"), ReturnToGo("horizon")):
-        assert definition.of_logs(np.zeros(0), np.zeros(1, dtype=np.int64)).shape == (0,)
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"definition": "tomorrow"}, "'tomorrow'; choose from session, discounted, horizon"),
         ({"discount": 0.0}, "discount 0.0"),
         ({"discount": 1.5}, "discount 1.5"),
-        ({"discount": float("nan")}, "discount nan"),
         ({"horizon": 0}, "horizon 0"),
     ],
 )
@@ -82,19 +74,13 @@ def test_wrong_definitions_are_refused(wrong: dict[str, object], message: str) -
 
 
 @given(episodes_of_eighths)
-def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_go(
-    episodes: list[list[float]],
-) -> None:
+def test_acting_with_the_logged_return_as_target_is_training(episodes: list[list[float]]) -> None:
     """With an episode's return as target return and its rewards, acting repeats its values."""
-    returns = ReturnToGo()
-    trained = returns.of_logs(*flat(episodes)).tolist()
-    seen: list[float] = []
+    returns, seen = ReturnToGo(), list[float]()
     for episode in episodes:
-        collected = torch.zeros(1).double()
-        for reward in episode:
-            seen += returns.target_returns(sum(episode), collected).float().tolist()
-            collected += reward
-    assert seen == trained
+        collected = torch.tensor([sum(episode[:t]) for t in range(len(episode))]).double()
+        seen += returns.target_returns(sum(episode), collected).float().tolist()
+    assert seen == returns.of_logs(*flat(episodes)).tolist()
 
 
 def test_only_a_target_of_a_session_is_lowered_by_rewards() -> None:

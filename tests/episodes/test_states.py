@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.support.episodes import DIM, N_ITEMS, Logged, random_episodes, some_states, write_store
-from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
+from ucfrec.episodes.states import TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
@@ -90,17 +90,15 @@ def test_bits_do_not_depend_on_the_batch(batch: int) -> None:
     """Vectorised kernels end in a remainder; no row may notice where it stands."""
     generator = torch.Generator().manual_seed(0)
     states = some_states(users=2, window=4)
-    items = torch.randint(-1, N_ITEMS, (1000, 6), generator=generator)
-    rewards = torch.randn(1000, 6, generator=generator)
-    steps = torch.randint(5000, (1000, 3), generator=generator)
-    users = torch.randint(-1, 5, (1000,), generator=generator)
-    seen = torch.randn(1000, 3, 3, generator=generator)
-    whole = states.build(items, rewards, steps, users, seen)
-    parts = [
-        states.build(items[i], rewards[i], steps[i], users[i], seen[i])
-        for i in torch.arange(1000).split(batch)
-    ]
-    assert torch.equal(torch.cat(parts), whole)
+    given = (
+        torch.randint(-1, N_ITEMS, (1000, 6), generator=generator),
+        torch.randn(1000, 6, generator=generator),
+        torch.randint(5000, (1000, 3), generator=generator),
+        torch.randint(-1, 5, (1000,), generator=generator),
+        torch.randn(1000, 3, 3, generator=generator),
+    )
+    parts = zip(*(each.split(batch) for each in given), strict=True)
+    assert torch.equal(torch.cat([states.build(*part) for part in parts]), states.build(*given))
 
 
 def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
@@ -132,15 +130,11 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
         ({"tags": torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64)}, "of at most 16"),
         ({"tags": torch.zeros(N_ITEMS, 2)}, "integers"),
         ({"tags": torch.full((N_ITEMS, 1), N_ITEMS)}, "are not numbers from -1 to"),
-        ({"tags": torch.full((N_ITEMS, 1), -2)}, "are not numbers from -1 to"),
         ({"tags": torch.zeros(N_ITEMS - 1, 1, dtype=torch.int64)}, "one row per item"),
-        ({"tags": torch.zeros(N_ITEMS, dtype=torch.int64)}, "one row per item"),
         ({"reward_low": 3.0}, "reward_low must be below reward_high"),
         ({"reward_high": float("nan")}, "reward_low must be below reward_high"),
         ({"window": 2.0}, "have window 2.0"),
-        ({"window": 10**9}, "have window 1000000000"),
         ({"decay": "x"}, "decay 'x'; give 1 to 10,000 and 0 to 1"),
-        ({"decay": float("nan")}, "decay nan"),
     ],
 )
 def test_what_strangers_wrote_is_checked(
@@ -149,18 +143,11 @@ def test_what_strangers_wrote_is_checked(
     path = tmp_path / "states.safetensors"
     some_states().save(path)
     tensors, about = load_tensors(path)
-    tags = {name: changed[name] for name in changed if name == "tags"}
-    numbers = {name: changed[name] for name in changed if name != "tags"}
-    save_tensors(path, {**tensors, **tags}, {**about, **numbers})
+    part = tensors if "tags" in changed else about
+    part.update(changed)
+    save_tensors(path, tensors, about)
     with pytest.raises(InputError, match=message):
         ItemStates.load(path)
-
-
-def test_a_catalogue_has_at_most_a_thousand_tags() -> None:
-    plain = ItemStates(torch.zeros(2000, 2), torch.zeros(0, 0), 0.0, 1.0)
-    replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS - 1))
-    with pytest.raises(InputError, match="are not numbers from -1 to 999"):
-        replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS))
 
 
 def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:
@@ -168,7 +155,4 @@ def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:
     path = tmp_path / "store" / "item_states.safetensors"
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError, match=r"item_states\.safetensors is damaged"):
-        EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)
-    path.unlink()
-    with pytest.raises(InputError, match=r"item_states\.safetensors does not exist"):
         EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)

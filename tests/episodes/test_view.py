@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,37 +30,26 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 
-lengths_of_episodes = st.lists(st.integers(1, 8), min_size=1, max_size=6)
-
 
 @given(
-    lengths=lengths_of_episodes,
+    lengths=st.lists(st.integers(1, 8), min_size=1, max_size=6),
     length=st.integers(1, 10),
-    window=st.integers(1, 5),
-    users=st.integers(0, 2),
-    observation=st.integers(0, 2),
+    state=st.tuples(st.integers(0, 2), st.integers(1, 5)),
+    observed=st.integers(0, 2),
     items=st.booleans(),
-    shard_steps=st.sampled_from(SHARDS),
+    shards=st.sampled_from(SHARDS),
     data=st.data(),
 )
 def test_windows_equal_a_row_by_row_reading(
-    lengths: list[int],
-    length: int,
-    window: int,
-    users: int,
-    observation: int,
-    items: bool,
-    shard_steps: int,
-    data: st.DataObject,
+    lengths: list[int], length: int, state: Any, observed: int, items: bool, shards: int, data: Any
 ) -> None:
-    observation = observation if items else observation + 1
-    episodes = random_episodes(lengths, seed=len(lengths), observation=observation, items=items)
-    states = some_states(users, window) if items else None
+    episodes = random_episodes(lengths, len(lengths), observed + (not items), items)
+    states = some_states(*state) if items else None
     episode = st.integers(0, len(lengths) - 1)
     chosen = data.draw(st.lists(episode, min_size=1, max_size=8))
     ends = [data.draw(st.integers(0, lengths[e] - 1)) for e in chosen]
     with tempfile.TemporaryDirectory() as name:
-        store = write_store(Path(name) / "store", episodes, states, shard_steps)
+        store = write_store(Path(name) / "store", episodes, states, shards)
         got = store.windows(np.array(chosen), np.array(ends), length)
 
     assert got.states.dtype == got.rewards.dtype == got.returns_to_go.dtype == torch.float32
@@ -74,10 +64,8 @@ def test_windows_equal_a_row_by_row_reading(
             assert got.rewards[b, k] == logged.rewards[step]
             assert got.returns_to_go[b, k] == logged.return_to_go(step)
             assert got.timesteps[b, k] == step
-            if logged.actions is None:
-                assert got.actions[b, k] == logged.items[step]
-            else:
-                assert np.array_equal(got.actions[b, k], logged.actions[step])
+            taken = logged.items if items else logged.actions
+            assert np.array_equal(got.actions[b, k], taken[step])
             expected = state_before(logged, step, states)
             np.testing.assert_allclose(got.states[b, k], expected, rtol=1e-5, atol=1e-6)
 
@@ -107,10 +95,9 @@ def test_views_see_their_episodes_only(tmp_path: Path, shard_steps: int) -> None
     assert are_equal(view.windows(*at, 5), store.windows(np.array([4, 4, 6]), at[1], 5))
     nothing = np.empty(0, dtype=np.int64)
     assert store.windows(nothing, nothing, 4).states.shape == (0, 4, store.state_size)
-    walked = view.all_steps()
-    assert np.array_equal(view.locate(np.arange(view.n_steps)), walked)
-    assert walked[0].tolist() == [0] * LENGTHS[4] + [1] * LENGTHS[6]
-    assert walked[1].tolist() == [*range(LENGTHS[4]), *range(LENGTHS[6])]
+    walked = [(number, t) for number, e in enumerate((4, 6)) for t in range(LENGTHS[e])]
+    assert list(zip(*view.all_steps(), strict=True)) == walked
+    assert np.array_equal(view.locate(np.arange(view.n_steps)), view.all_steps())
 
 
 @pytest.mark.parametrize("shard_steps", SHARDS)
@@ -130,18 +117,14 @@ def test_a_view_leaves_out_some_of_what_was_observed(
         assert are_equal(replace(seen, states=whole.states), whole)
     last = all_windows(view.without_observation_dimensions([0]), 4)
     assert torch.equal(last.states[..., -1], all_windows(view, 4).states[..., -1])
-    assert last.states.shape[-1] == view.state_size - 1
-    assert store.observation_size == 3
 
 
 def test_steps_that_an_episode_does_not_have_are_refused(tmp_path: Path) -> None:
     store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
     for episodes, ends, length, message in (
         ([0], [LENGTHS[0]], 2, "episode 0 has 3 steps, none numbered 3"),
-        ([0], [-1], 2, "episode 0 has 3 steps, none numbered -1"),
         ([-1], [0], 2, "no episodes -1 to -1"),
         ([0, len(LENGTHS)], [0, 0], 2, f"no episodes 0 to {len(LENGTHS)}"),
-        ([0, 1], [0], 2, "two arrays of the same length"),
         ([[0]], [[0]], 2, "two arrays of the same length"),
         ([0], [0], 0, "at least 1 step"),
     ):
@@ -149,6 +132,8 @@ def test_steps_that_an_episode_does_not_have_are_refused(tmp_path: Path) -> None
             store.windows(np.array(episodes), np.array(ends), length)
     with pytest.raises(InputError, match="no split is called 'training'; there are train, valid"):
         store.split("training")
+    with pytest.raises(InputError, match="no column 'action'"):
+        store.step_values(schema.ACTION, np.array([0]), np.array([0]))
 
 
 def test_columns_are_mapped_when_they_are_used(tmp_path: Path) -> None:
@@ -169,7 +154,6 @@ def test_columns_are_mapped_when_they_are_used(tmp_path: Path) -> None:
     [
         (lambda text: '{"version": 99}', "upgrade ucfrec"),
         (lambda text: text.replace('"reward": "reward"', '"reward": "x"'), "was changed after"),
-        (lambda text: "{", r"meta\.json"),
         (lambda text: None, r"not an episode store.*meta\.json"),
     ],
 )
@@ -192,8 +176,6 @@ def use(store: EpisodeStore) -> None:
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
     "missing": Path.unlink,
-    "empty": lambda path: path.write_bytes(b""),
-    "cut in the header": lambda path: path.write_bytes(path.read_bytes()[:50]),
     "cut in the data": lambda path: path.write_bytes(path.read_bytes()[:-3]),
     "not numpy": lambda path: path.write_bytes(b"PK or something else entirely" * 9),
     "a flipped bit": lambda path: path.write_bytes(
@@ -206,14 +188,11 @@ COLUMNS = ("reward", "item", "return_to_go", "offsets", "user")
 @pytest.mark.parametrize(
     ("column", "damage"), [*product(COLUMNS, ["a flipped bit"]), *product(["item"], DAMAGE)]
 )
-def test_a_damaged_column_is_named_when_it_is_used(
-    tmp_path: Path, column: str, damage: str
-) -> None:
+def test_a_damaged_column_is_named(tmp_path: Path, column: str, damage: str) -> None:
     store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
     DAMAGE[damage](tmp_path / "store" / "shard-00001" / f"{column}.npy")
-    with pytest.raises(InputError, match=rf"shard-00001/{column}\.npy") as caught:
+    with pytest.raises(InputError, match=rf"shard-00001/{column}\.npy"):
         use(EpisodeStore.open(store.path))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -221,7 +200,6 @@ def test_a_damaged_column_is_named_when_it_is_used(
     [
         ("reward", lambda values: values[:-1], "'reward' has 31 of 32 steps"),
         ("offsets", lambda values: values[[0, 2, 1, *range(3, 9)]], "do not ascend from 0"),
-        ("offsets", lambda values: values[[0, 1, 1, *range(3, 9)]], "do not ascend from 0"),
         ("offsets", lambda values: np.put(values, [1, 2], [2**63 - 1, -(2**63)]), "do not ascend"),
         ("item", lambda values: np.put(values, 3, 10**6), "has items from 0 to 1000000, there are"),
     ],
@@ -240,13 +218,6 @@ def test_a_column_that_cannot_be_is_named(
     write_json(store.path / "meta.json", {**read_json(store.path / "meta.json"), "files": {}})
     with pytest.raises(InputError, match=message):
         use(EpisodeStore.open(store.path))
-
-
-def test_a_column_that_was_never_logged_is_named(tmp_path: Path) -> None:
-    steps = {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))}
-    store = EpisodeStore.write(tmp_path / "store", steps, np.array([3]))
-    with pytest.raises(InputError, match="no column 'propensity'"):
-        store.step_values(schema.PROPENSITY, np.array([0]), np.array([0]))
 
 
 @pytest.mark.parametrize("long_enough", [1, 1000])

@@ -53,50 +53,38 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
     policy.eval()
     before = policy.loss(windows)[1]
     trained(policy, windows, 25)
-    loss, scalars = policy.loss(windows)
-    assert torch.isfinite(loss)
-    assert {"action_loss", "value_loss"} <= scalars.keys()
-    assert scalars["value_loss"] < before["value_loss"]
+    assert policy.loss(windows)[1]["value_loss"] < before["value_loss"]
     assert torch.isfinite(policy.action_loss(windows))
     sessions = sessions_of(windows)
     for rule in (DecisionRule(None), DecisionRule(2.0)):
         assert torch.isfinite(Scorer(policy, rule).act(sessions)).all()
     if sizes["items"]:
-        term = policy.head.exposure  # type: ignore[union-attr]
-        moved = torch.cat([parameter.flatten() for parameter in term.parameters()])
-        assert (moved != 0).any(), "the exposure term learns too"
+        assert any(each.any() for each in policy.head.exposure.parameters()), "it learns too"
 
 
 @pytest.mark.parametrize("name", [*POLICIES, "bc"])
 def test_every_learner_learns_from_sampled_items(name: str) -> None:
     settings = {"sampled_above": ITEMS - 1, "sampled_items": 4, **ADDITIONS, "exposure": True}
     policy, windows = build(name, TAGGED, **settings), random_windows(TAGGED)
-    assert isinstance(policy.head, ItemHead)
-    with torch.no_grad():
-        expected = policy.eval().action_loss(windows)
+    before = policy.eval().action_loss(windows).detach()
     optimizer = RowAdamW(policy.parameters(), lr=1e-2)
     policy.train()
     for step in range(20):
         torch.manual_seed(step)
         optimizer.zero_grad()
         policy.loss(windows)[0].backward()  # type: ignore[no-untyped-call]
-        assert policy.head.correction.grad is not None
         assert policy.head.correction.grad.is_sparse
         optimizer.step()
-    with torch.no_grad():
-        assert policy.eval().action_loss(windows) < expected - 0.05
+    assert policy.eval().action_loss(windows) < before - 0.05
 
 
 @policies
 def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     windows = random_windows(TAGGED)
     policy = trained(build(name, TAGGED, exposure=True, exposure_window=3), windows, 25)
-    head = policy.head
-    assert isinstance(head, ItemHead)
-    assert head.exposure is not None
+    head, normalized = policy.head, policy.normalize(windows)
     for parameter in head.exposure.parameters():
         parameter.data += 0.1
-    normalized = policy.normalize(windows)
     with torch.no_grad():
         plain = head.predict(policy.features(normalized)[:, -1])
         last = torch.arange(1, len(plain) + 1) * K - 1
@@ -109,7 +97,6 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
 def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
     policy, windows = build("dt", sizes, **ADDITIONS).eval(), random_windows(sizes)
     normalized = policy.normalize(windows)
-    assert policy.values is not None
     mask = windows.mask
     values = policy.values(normalized, policy.head.embed(windows.actions))[mask]
     returns = normalized.returns_to_go[mask]
@@ -134,7 +121,7 @@ def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
 def test_exposure_reaches_as_far_as_the_context() -> None:
     for context, window, lags in ((K, 3, 3), (K, 10, K - 1), (1, 10, 0)):
         policy = build("dt", TAGGED, exposure=True, exposure_window=window, context=context)
-        term = policy.head.exposure  # type: ignore[union-attr]
+        term = policy.head.exposure
         assert (0 if term is None else term.lags) == lags
     with pytest.raises(InputError, match=r"policy\.exposure_window is 0"):
         build("dt", TAGGED, exposure=True, exposure_window=0)
@@ -169,11 +156,8 @@ def test_the_loss_is_least_at_the_mean_and_the_expectile(sample: list[float]) ->
         return float(ValueHead.loss(values.expand(len(returns), 2), returns))
 
     lowest = loss(best)
-    for step in (-0.1, 0.1):
-        for place in range(2):
-            moved = best.clone()
-            moved[place] += step
-            assert loss(moved) > lowest
+    for moved in torch.tensor([[0.1, 0], [-0.1, 0], [0, 0.1], [0, -0.1]]):
+        assert loss(best + moved) > lowest
 
 
 @pytest.mark.parametrize("t", [0, 3])
@@ -190,9 +174,8 @@ def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
     after = head(replace(changed, states=states), played)
     torch.testing.assert_close(before[:, : t + 1], after[:, : t + 1])
     assert not torch.allclose(before[:, t + 1 :], after[:, t + 1 :])
-    states = windows.states.clone()
-    states[:, 0] += 1
-    assert not torch.allclose(before[:, t], head(replace(windows, states=states), actions)[:, t])
+    first = head(changed_at(windows, (slice(None), 0), ("states",)), actions)
+    assert not torch.allclose(before[:, t], first[:, t])
     later = head(replace(windows, timesteps=windows.timesteps + 5), actions)
     assert not torch.allclose(before[:, t], later[:, t])
 
@@ -209,9 +192,8 @@ def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float,
     advantage = returns - means
     spread = float(advantage.std(correction=0))
     if spread == 0:
-        assert (weights == 1).all()
+        torch.testing.assert_close(weights, torch.ones_like(weights))
     if spread > 1e-3:
         expected = (advantage / spread).clamp(-5, 3).exp()
         torch.testing.assert_close(weights, expected / expected.mean())
-    order = advantage.argsort()
-    assert (weights[order].diff() >= -1e-12).all()
+    assert (weights[advantage.argsort()].diff() >= -1e-12).all()

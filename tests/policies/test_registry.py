@@ -54,9 +54,6 @@ class ReadsValue(Mine):
         super().__init__(config, sizes)
         assert float(self.net[0].weight.abs().mean()) > 0
 
-class NotOne:
-    pass
-
 class Odd(SequencePolicy):
     Config = dict
 
@@ -72,12 +69,11 @@ mine = my_learner:Mine
 dt = my_learner:Mine
 tied = my_learner:Tied
 reads-value = my_learner:ReadsValue
-not-one = my_learner:NotOne
+not-one = my_learner:MineConfig
 odd = my_learner:Odd
 unchecked = my_learner:Unchecked
 gone = my_learner:Gone
 raises = my_raising:Mine
-nonsense = my_nonsense:Mine
 nowhere = no_such_learner:Mine
 """
 
@@ -99,7 +95,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     info = distribution(site, "my-policy", "1.0", ENTRY_POINTS)
     (site / "my_learner.py").write_text(MINE)
     (site / "my_raising.py").write_text("raise ValueError('of my own')")
-    (site / "my_nonsense.py").write_text("def (")
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.delitem(sys.modules, "my_learner", raising=False)
     return info
@@ -107,11 +102,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def small_store(path: Path) -> EpisodeStore:
     rng = np.random.default_rng(0)
-    columns = {
-        "observation": rng.normal(size=(60, 3)),
-        "action": rng.uniform(-1, 1, size=(60, 2)),
-        "reward": rng.random(60),
-    }
+    columns = {"observation": rng.normal(size=(60, 3)), "reward": rng.random(60)}
+    columns["action"] = rng.uniform(-1, 1, size=(60, 2))
     return EpisodeStore.write(path, columns, np.full(12, 5))
 
 
@@ -147,7 +139,7 @@ def test_a_policy_is_read_back_as_it_was_trained(tmp_path: Path, name: str, aver
         if name == "tied":
             weights = load_trained(tmp_path / "run" / "policy" / f"{each}.safetensors")
             assert torch.equal(weights["one.weight"], weights["two.weight"])
-            assert torch.equal(weights["one.weight"], policy.one.weight)  # type: ignore[arg-type, union-attr]
+            assert torch.equal(weights["one.weight"], policy.one.weight)
 
 
 def test_a_run_knows_the_package_of_its_policy(
@@ -157,15 +149,13 @@ def test_a_run_knows_the_package_of_its_policy(
     config = resolve_config("mine", None, ["train.steps=2", "policy.dim=8"])
     record = train_run(small_store(tmp_path / "store"), run, config)
     assert (record.policy_package, record.versions["my-policy"]) == ("my-policy", "1.0")
-    TrainedPolicy.load(run)  # the same version is no reason to warn
     distribution(tmp_path / "site", "my-policy", "1.1", ENTRY_POINTS)
     with pytest.warns(InputNote, match="trained with my-policy 1.0, but my-policy 1.1 is instal"):
         TrainedPolicy.load(run)
     (tmp_path / "site" / "my_learner.py").unlink()
     monkeypatch.delitem(sys.modules, "my_learner")
-    with pytest.raises(InputError, match=r"my_learner:Mine, which cannot be imported") as caught:
+    with pytest.raises(InputError, match=r"my_learner:Mine, which cannot be imported"):
         TrainedPolicy.load(run)
-    assert "train it again" not in str(caught.value)
     shutil.rmtree(installed)
     missing = r"policy 'mine' \(of package my-policy 1.0\), which is not installed: install it$"
     with pytest.raises(InputError, match=missing):
@@ -183,13 +173,9 @@ def test_a_built_in_policy_has_no_package_and_a_plugin_of_its_name_is_noted(tmp_
 
 
 @pytest.mark.usefixtures("installed")
-@pytest.mark.parametrize("target", ["my_learner:Tied", "my_learner:Mine"])
-def test_two_packages_may_not_have_one_name(tmp_path: Path, target: str) -> None:
-    entry = f"[ucfrec.policies]\nmine = {target}\n"
+def test_two_packages_may_not_have_one_name(tmp_path: Path) -> None:
+    entry = "[ucfrec.policies]\nmine = my_learner:Tied\n"
     distribution(tmp_path / "site", "another-policy", "2.0", entry)
-    if target == "my_learner:Mine":
-        assert policy_class("mine").__name__ == "Mine"
-        return
     with pytest.raises(InputError, match=r"packages another-policy and my-policy both .* 'mine'"):
         policy_class("mine")
 
@@ -200,7 +186,6 @@ def test_an_installed_learner_is_listed_with_its_settings(
 ) -> None:
     assert policy_names()[: len(BUILT_IN)] == tuple(BUILT_IN)
     assert "mine" in policy_names()
-    assert policy_class("dt").__module__ == "ucfrec.policies.dt"
     assert main(["settings", "--policy", "mine"]) == 0
     assert "policy.depth" in capsys.readouterr().out
     assert resolve_config("mine", None, ["policy.depth=3"]).policy.depth == 3
@@ -217,7 +202,6 @@ def test_an_installed_learner_is_listed_with_its_settings(
         ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
         ("gone", "my_learner:Gone, which cannot be imported"),
         ("raises", r"my_raising:Mine, which cannot be imported \(ValueError: of my own\)"),
-        ("nonsense", r"my_nonsense:Mine, which cannot be imported \(SyntaxError"),
         ("nowhere", "no_such_learner:Mine, which cannot be imported"),
         ("min", "choose from ucf, ucf-paper, dt, .*, mine"),
     ],

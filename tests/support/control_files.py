@@ -24,8 +24,7 @@ def hopper_like(lengths: tuple[int, ...] = (4, 1, 6, 3), seed: int = 0) -> Colum
     rng = np.random.default_rng(seed)
     n = sum(lengths)
     ends = np.cumsum(lengths) - 1
-    terminals, timeouts = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    terminals[ends[::2]], timeouts[ends[1::2]] = True, True
+    terminals, timeouts = (np.isin(np.arange(n), ends[first::2]) for first in (0, 1))
     observations = rng.normal(size=(n, 11)).astype(np.float32)
     finals = rng.normal(size=(len(lengths), 11)).astype(np.float32)
     following = np.vstack([observations[1:], observations[:1]])

@@ -1,6 +1,5 @@
 """Small Gymnasium environments, registered under names that start with `ucfrec-test/`."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -17,19 +16,10 @@ class Echo(gymnasium.Env[Any, Any]):
     no fixed size. `users` is the `user_id` of every `info`, `visitors` those of one session after
     the other, told by `reset` alone."""
 
-    def __init__(
-        self,
-        actions: spaces.Space[Any],
-        whole: bool = False,
-        users: Any = None,
-        notes: bool = False,
-        visitors: Sequence[int | None] = (),
-    ) -> None:
+    def __init__(self, actions: Any, whole=False, users=None, notes=False, visitors=()) -> None:
         self.action_space, self._whole, self._users = actions, whole, users
-        entries: dict[str, spaces.Space[Any]] = {
-            "step": spaces.Discrete(LENGTH + 1),
-            "secret": spaces.Box(0, 1, (2, 1), dtype=np.float64),
-        }
+        entries = {"step": spaces.Discrete(LENGTH + 1)}
+        entries["secret"] = spaces.Box(0, 1, (2, 1), dtype=np.float64)
         if notes:
             entries["notes"] = spaces.Sequence(spaces.Discrete(3))
         self.observation_space = entries["step"] if whole else spaces.Dict(entries)
@@ -43,12 +33,10 @@ class Echo(gymnasium.Env[Any, Any]):
         return {"step": self._step, "secret": np.full((2, 1), self._secret), "notes": (1, 2)}
 
     def _info(self) -> dict[str, Any]:
-        info: dict[str, Any] = {"shape that changes": np.zeros(self._step)}
+        info = {"shape that changes": np.zeros(self._step)}
         return info if self._users is None else info | {"user_id": self._users}
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self._step, self._secret = 0, self.np_random.random()
         user = next(self._visitors, None)

@@ -44,18 +44,11 @@ def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
     row, action, q = np.arange(len(ours["reward"])), ours["action"], ours["q"]
     v = (ours["target"] * q).sum(axis=1)
     length = 1 if name == "bandit" else 5
-    clusters = {}
+    own = {"discount": float(given["gamma"])}
     if name == "bandit":
-        for policy, column in (("behavior", "propensity"), ("target", "target")):
-            same = ours["cluster"] == ours["cluster"][action][:, None]
-            clusters[f"cluster_{column}"] = (ours[policy] * same).sum(axis=1).clip(max=1)
-    steps = LoggedSteps(
-        session=row // length,
-        reward=ours["reward"],
-        propensity=ours["behavior"][row, action],
-        target=ours["target"][row, action],
-        model=Modelled(reward=v, q=q[row, action], v=v, logged_reward=q[row, action]),
-        discount=1.0 if name == "bandit" else float(given["gamma"]),
-        **clusters,
-    )
-    return steps, ours | shared
+        same = ours["cluster"] == ours["cluster"][action][:, None]
+        shares = ((ours[p] * same).sum(axis=1).clip(max=1) for p in ("behavior", "target"))
+        own = dict(zip(("cluster_propensity", "cluster_target"), shares, strict=True))
+    own["model"] = Modelled(reward=v, q=q[row, action], v=v, logged_reward=q[row, action])
+    chosen = (ours[policy][row, action] for policy in ("behavior", "target"))
+    return LoggedSteps(row // length, ours["reward"], *chosen, **own), ours | shared

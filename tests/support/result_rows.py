@@ -27,7 +27,7 @@ def read_configurations(folder: Path) -> dict[str, Any]:
 def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:
     """Rows of a method without a distractor, with it off and on: a value a seed."""
     metrics = {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0}
-    shared: dict[str, Any] = {"metrics": metrics, "target_return": 3.0}
+    shared = {"metrics": metrics, "target_return": 3.0}
     return [
         result_row(value, **shared, training_seed=seed, conditions=conditions)
         for quantile in ("0.99", "1")

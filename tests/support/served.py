@@ -57,7 +57,6 @@ def _trained_run(policy: str) -> "TemporaryDirectory[str]":
 
 def learn_tastes(trained: TrainedPolicy) -> None:
     """Give the run's reward model tastes that sessions show, as where users are new."""
-    assert trained.reward_model is not None
     tastes, random = trained.reward_model.tastes, torch.Generator().manual_seed(3)
     tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())
     tastes.usual.fill_(0.4)

@@ -1,6 +1,6 @@
 """An environment of one session, as Gymnasium's own checks take it."""
 
-from typing import Any, SupportsFloat, cast
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -18,9 +18,7 @@ class SingleSession(gymnasium.Env[Float32Array, Array]):
         self.observation_space = environment.single_observation_space
         self.action_space = environment.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float32Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Float32Array, Any]:
         """Start a session; returns the observation (O,) and info."""
         super().reset(seed=seed, options=options)
         observations, infos = self._environment.reset(seed=seed, options=options)
@@ -30,7 +28,7 @@ class SingleSession(gymnasium.Env[Float32Array, Array]):
         """Take one action; returns observation (O,), reward, terminated, truncated and info."""
         seen, rewards, ends, cuts, infos = self._environment.step(np.asarray(action)[None])
         ended = bool(ends[0] | cuts[0])
-        observation = cast(Float32Array, infos["final_obs"][0]) if ended else seen[0]
+        observation = infos["final_obs"][0] if ended else seen[0]
         info = _first(infos["final_info"] if ended else infos)
         return observation, float(rewards[0]), bool(ends[0]), bool(cuts[0]), info
 

@@ -88,12 +88,10 @@ def list_parts(inputs: Inputs, folder: Path, cases: dict[str, int], seed: int) -
         for number, job in enumerate(jobs):
             if share := share_evenly(cases.get(check, 0), len(jobs), number):
                 yield check, job.name, partial(getattr(ends(number), check), share, seed)
-    whole = (
-        Reader("store", inputs.store, "meta.json", read_store),
-        Reader("run", inputs.single_run, "run.json", read_run),
-    )
-    for number, reader in enumerate(whole):
-        if share := share_evenly(cases.get("flips", 0), len(whole), number):
+    store = Reader("store", inputs.store, "meta.json", read_store)
+    run = Reader("run", inputs.single_run, "run.json", read_run)
+    for number, reader in enumerate((store, run)):
+        if share := share_evenly(cases.get("flips", 0), 2, number):
             yield "flips", reader.name, partial(flip_bits, reader, folder, share, seed)
     if "fuzz" in cases:
         readers = list_readers(inputs)

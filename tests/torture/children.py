@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,8 +71,6 @@ class Running:
             except SystemExit as end:
                 status = end.code if isinstance(end.code, int) else 1
             except BaseException:
-                import traceback
-
                 traceback.print_exc()
             finally:
                 with contextlib.suppress(BaseException):
@@ -143,11 +142,9 @@ def run_first(*arguments: object) -> End:
 
 def run_fresh(*arguments: object, number: int, moment: float) -> End:
     """One command in a new interpreter, which gets the signal `number` after `moment` seconds."""
-    command_line = [sys.executable, "-m", "ucfrec", *map(str, arguments)]
-    start = time.monotonic()
-    started = subprocess.Popen(
-        command_line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
+    words, start = [sys.executable, "-m", "ucfrec", *map(str, arguments)], time.monotonic()
+    to = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    started = subprocess.Popen(words, text=True, **to)
     if number != signal.SIGKILL:
         # Before that, Python's own handlers answer. TERM has a handler first of all in ucfrec.
         wait_until_handled(started.pid, signal.SIGTERM)

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,10 +46,8 @@ class Inputs:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.logs, self.store, self.run = folder / "logs", folder / "store", folder / "run"
-        environment = ("--env", "synthetic-catalog", "--sessions", 60)
-        require_done("collect", *environment, "--out", self.logs)
-        require_done("prepare", self.log, "--out", self.store, "--reward", "is_click")
-        require_done("train", self.store, "--out", self.run, *SETTINGS)
+        for job, out in zip(self.jobs(), (self.logs, self.store, self.run), strict=False):
+            require_done(*job.arguments(out))
         self.single_run, self.texts = folder / "single-run", folder / "texts"
         # Readers of a run with a refit read the files of the refit.
         shutil.copytree(self.run, self.single_run, ignore=shutil.ignore_patterns("refit"))
@@ -146,8 +145,6 @@ def _numbers(value: object) -> object:
 
 def use_temporary(folder: Path) -> None:
     """Make a folder inside `folder` the one for temporary files."""
-    import tempfile
-
     tempfile.tempdir = None
     os.environ["TMPDIR"] = str(folder / "tmp")
     (folder / "tmp").mkdir()

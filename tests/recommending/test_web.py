@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import pandas as pd
 import pytest
@@ -25,30 +26,28 @@ from ucfrec.recommending.web import ServerLimits, application  # noqa: E402
 
 
 @asynccontextmanager
-async def client(by: Responder, **limits: Any) -> AsyncIterator[Any]:
+async def client(by: Responder, *hosts: Any, **limits: Any) -> AsyncIterator[Any]:
     """A client of the application, without a network."""
-    app = application(by, ServerLimits(**limits))
+    app = application(by, ServerLimits(**limits), *hosts)
     transport = httpx.ASGITransport(app=app)
-    async with (
-        app.router.lifespan_context(app),
-        httpx.AsyncClient(transport=transport, base_url="http://test") as each,
-    ):
-        yield each
+    http = httpx.AsyncClient(transport=transport, base_url="http://test")
+    async with app.router.lifespan_context(app), http:
+        http.app = app
+        yield http
 
 
-class Slow:
-    """Counts the batches of a responder, and takes its time over them."""
+def slow(by: Responder, seconds: float) -> list[int]:
+    """Let a responder take its time over its batches, whose sizes are returned."""
+    sizes: list[int] = []
+    answer = by.answers
 
-    def __init__(self, by: Responder, seconds: float) -> None:
-        self.sizes: list[int] = []
-        answer = by.answers
+    def slowly(requests: Sequence[Any]) -> Any:
+        sizes.append(len(requests))
+        time.sleep(seconds)
+        return answer(requests)
 
-        def slowly(requests: Sequence[Any]) -> Any:
-            self.sizes.append(len(requests))
-            time.sleep(seconds)
-            return answer(requests)
-
-        by.answers = slowly  # type: ignore[method-assign]
+    by.answers = slowly  # type: ignore[method-assign]
+    return sizes
 
 
 def test_answers_are_those_of_the_command_and_share_passes(
@@ -60,7 +59,7 @@ def test_answers_are_those_of_the_command_and_share_passes(
     arguments = [str(trained.folder), str(tmp_path / "log.parquet"), *rule.split()]
     assert main(["recommend", *arguments, "--out", str(tmp_path / "out")]) == 0
     by = responder(trained, rule=FULL)
-    slow = Slow(by, 0.05)
+    sizes = slow(by, 0.05)
 
     async def ask() -> tuple[list[dict[str, Any]], str]:
         async with client(by, batch=8) as http:
@@ -76,11 +75,11 @@ def test_answers_are_those_of_the_command_and_share_passes(
         as_frame(answers), expected, check_dtype=False, rtol=1e-5, atol=1e-6
     )
     # The first starts at once, or with those that came in the same moment; the others share.
-    assert sum(slow.sizes) == 12
-    assert len(slow.sizes) <= 4
-    assert max(slow.sizes) <= 8
+    assert sum(sizes) == 12
+    assert len(sizes) <= 4
+    assert max(sizes) <= 8
     assert 'ucfrec_requests_total{status="200"} 12.0' in metrics
-    assert f"ucfrec_batch_requests_count {len(slow.sizes)}.0" in metrics
+    assert f"ucfrec_batch_requests_count {len(sizes)}.0" in metrics
 
 
 WRONG: dict[str, tuple[bytes, int, str]] = {
@@ -103,10 +102,8 @@ def test_a_bad_request_has_one_error(trained: TrainedPolicy, case: str) -> None:
     async def ask() -> list[Any]:
         async with client(responder(trained, limits=limits, k=5)) as http:
             # With and without its length stated.
-            return [
-                await http.post("/recommendations", content=content)
-                for content in (body, chunks(), b'{"user_id": 1}')
-            ]
+            given = (body, chunks(), b'{"user_id": 1}')
+            return [await http.post("/recommendations", content=each) for each in given]
 
     *wrong, right = asyncio.run(ask())
     for each in wrong:
@@ -119,7 +116,7 @@ def test_a_bad_request_has_one_error(trained: TrainedPolicy, case: str) -> None:
 
 def test_what_waits_too_long_or_is_too_much_is_told_so(trained: TrainedPolicy) -> None:
     by = responder(trained)
-    Slow(by, 0.4)
+    slow(by, 0.4)
 
     async def never() -> AsyncIterator[bytes]:
         yield b"{"
@@ -147,10 +144,7 @@ def test_a_defect_is_told_without_its_details(
 ) -> None:
     by = responder(trained)
 
-    def broken(_: Sequence[Any]) -> Any:
-        raise MemoryError("of 3 GiB")
-
-    by.answers = broken  # type: ignore[method-assign]
+    by.answers = Mock(side_effect=MemoryError("of 3 GiB"))  # type: ignore[method-assign]
 
     async def ask() -> Any:
         async with client(by) as http:
@@ -165,27 +159,14 @@ def test_a_defect_is_told_without_its_details(
 def test_a_client_that_hangs_up_is_no_defect(
     trained: TrainedPolicy, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arriving = iter(
-        [
-            {"type": "http.request", "body": b'{"user_id": ', "more_body": True},
-            {"type": "http.disconnect"},
-        ]
-    )
-
-    async def receive() -> dict[str, Any]:
-        return next(arriving)
-
-    async def send(_: Any) -> None:
-        pass
+    part = {"type": "http.request", "body": b'{"user_id": ', "more_body": True}
+    receive = AsyncMock(side_effect=[part, {"type": "http.disconnect"}])
 
     async def ask() -> str:
-        app = application(responder(trained), ServerLimits())
         path = {"path": "/recommendations", "raw_path": b"", "query_string": b"", "headers": []}
-        async with app.router.lifespan_context(app):
-            await app({"type": "http", "method": "POST", **path}, receive, send)
-            transport = httpx.ASGITransport(app=app)
-            async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
-                return str((await http.get("/metrics")).text)
+        async with client(responder(trained)) as http:
+            await http.app({"type": "http", "method": "POST", **path}, receive, AsyncMock())
+            return str((await http.get("/metrics")).text)
 
     metrics = asyncio.run(ask())
     assert 'ucfrec_requests_total{status="499"} 1.0' in metrics
@@ -225,15 +206,11 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
         ("::1", {"[::1]": 200, "[::1]:80": 200, "[::2]:80": 400}),
     ],
 )
-def test_hosts_that_are_allowed(
-    trained: TrainedPolicy, hosts: str, answered: dict[str, int]
-) -> None:
+def test_allowed_hosts(trained: TrainedPolicy, hosts: str, answered: dict[str, int]) -> None:
     given = list_hosts(hosts, "0.0.0.0")
 
     async def answers() -> dict[str, Any]:
-        app = application(responder(trained), ServerLimits(), given)
-        transport = httpx.ASGITransport(app=app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
+        async with client(responder(trained), given) as http:
             return {host: await http.get("/health", headers={"Host": host}) for host in answered}
 
     found = asyncio.run(answers())

@@ -11,6 +11,8 @@ from ucfrec.files.atomic import read_json, write_json
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
+Capsys = pytest.CaptureFixture[str]
+
 TINY = {
     "policy.dim": 8,
     "policy.context": 2,
@@ -29,14 +31,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_is_whole_is_said_to_be(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_whole_is_said_to_be(made: Path, capsys: Capsys) -> None:
     assert main(["verify", str(made / "store"), str(made / "run")]) == 0
     store, run = capsys.readouterr().out.splitlines()
     assert "store: 11 of 11 files have the content that was written" in store
     assert "run: " in run
 
 
-def test_damage_is_one_line_a_file(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_one_line_a_file(made: Path, capsys: Capsys) -> None:
     column = made / "store" / "shard-00000" / "reward.npy"
     before = column.read_bytes()
     column.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
@@ -54,9 +56,7 @@ def test_damage_is_one_line_a_file(made: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("name", ["\ud800", "a" * 5000, "x\ny"])
-def test_a_listed_name_that_no_file_has_is_a_fault(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_listed_names_without_file(made: Path, tmp_path: Path, capsys: Capsys, name: str) -> None:
     shutil.copytree(made / "store", tmp_path / "store")
     record = read_json(tmp_path / "store" / "meta.json")
     record["files"][name] = [1, "00"]
@@ -65,7 +65,7 @@ def test_a_listed_name_that_no_file_has_is_a_fault(
     assert "11 of 12 files have the content" in capsys.readouterr().out
 
 
-def test_other_paths(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_paths(made: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert main(["verify", str(tmp_path)]) == 2
     assert "neither an episode store" in capsys.readouterr().err
     (tmp_path / "rows.jsonl").write_text("{}\n")
@@ -78,9 +78,7 @@ def test_other_paths(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "run.json has no files; train it again" in capsys.readouterr().err
 
 
-def test_a_flipped_bit_of_a_run_is_found_by_whoever_reads_it(
-    made: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flipped_bit_of_a_run_is_found_by_whoever_reads_it(made: Path, capsys: Capsys) -> None:
     for name in ("policy/best.safetensors", "policy/metrics.jsonl"):
         path = made / "run" / name
         before = path.read_bytes()

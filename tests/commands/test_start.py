@@ -59,9 +59,7 @@ def test_help_needs_no_slow_import() -> None:
     assert not found[-1] & SLOW_TO_IMPORT
 
 
-def test_checking_and_preparing_a_log_need_neither_torch_nor_pandas(
-    log: Path, tmp_path: Path
-) -> None:
+def test_preparing_needs_neither_torch_nor_pandas(log: Path, tmp_path: Path) -> None:
     checked, prepared = loaded(
         ("prepare", log, "--validate"), ("prepare", log, "--out", tmp_path / "store")
     )
@@ -91,21 +89,3 @@ def test_what_works_on_a_run_imports_what_it_uses() -> None:
     assert len(found) == len(USED)
     for each, used in zip(found, USED.values(), strict=True):
         assert each & SLOW_TO_IMPORT <= used | {"pydantic"}
-
-
-def test_weights_are_loaded_without_the_compiler() -> None:
-    code = (
-        "import sys\n"
-        "from pathlib import Path\n"
-        "import torch\n"
-        "from ucfrec.episodes.exposure import ExposureTerm, Likeness\n"
-        "from ucfrec.fitting.checkpoint import load_module\n"
-        "from ucfrec.policies.base import embedding\n"
-        "def build():\n"
-        "    return torch.nn.ModuleList(\n"
-        "        [embedding(3, 2), ExposureTerm(2, 3, Likeness(3, 2, 0))])\n"
-        "load_module(Path('weights'), build, build().state_dict())\n"
-        "print('', *sys.modules, file=sys.stderr)\n"
-    )
-    (found,) = modules(code)
-    assert not found & {"torch._dynamo", "sympy", "scipy.stats", "boto3"}

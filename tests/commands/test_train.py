@@ -1,6 +1,5 @@
 """`ucfrec settings`: every key, its default, range and meaning; and the way there."""
 
-import re
 from dataclasses import asdict
 
 import pytest
@@ -24,20 +23,6 @@ def test_every_key_stands_in_its_section_and_its_default_is_taken_back(policy: s
         assert all(len(row) == 3 for row in cells), cells
         overrides += [f"{row[0]}={row[1]}" for row in cells if row[1] != "unset"]
     assert resolve_config(policy, None, overrides) == config
-
-
-@pytest.mark.parametrize("width", [60, 100, 160, 400])
-def test_lines_are_aligned_and_fit(width: int) -> None:
-    lines = settings_text("ucf", width).splitlines()
-    keys = [line for line in lines if re.match(r"  [a-z]+\.", line)]
-    starts = {
-        line.index("a whole number")
-        for line in keys
-        if "a whole number" in line and "each a whole number" not in line
-    }
-    assert len(starts) == 1
-    assert all(len(line) <= min(width, 160) for line in lines if line not in keys)
-    assert "K, steps of history that a prediction uses." in "\n".join(lines)
 
 
 def test_the_help_of_train_leads_here(capsys: pytest.CaptureFixture[str]) -> None:

@@ -128,7 +128,6 @@ def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
         item = int(train.step_values("item", episode[None], step[None])[0])
         shown[item] += 1
         liked[item] += int(train.step_values("reward", episode[None], step[None])[0])
-    assert trained.counts is not None
     assert trained.counts.shown.tolist() == [shown[item] for item in range(200)]
     assert trained.counts.liked.tolist() == [liked[item] for item in range(200)]
     best = DecisionRule(1.0)

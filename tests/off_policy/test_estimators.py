@@ -32,7 +32,6 @@ def rows_of(steps: LoggedSteps) -> list[list[int]]:
 
 def by_hand(steps: LoggedSteps) -> dict[str, float]:
     """The estimators one session and one step at a time, from their definitions."""
-    assert steps.model is not None
     sums = dict.fromkeys(("logged", "DM", "FQE", "IPS", "PDIS", "DR"), 0.0)
     weights = []
     for rows in rows_of(steps):
@@ -60,7 +59,6 @@ def by_hand(steps: LoggedSteps) -> dict[str, float]:
 
 def normalised_by_hand(steps: LoggedSteps) -> dict[str, float]:
     """Weighted PDIS and weighted DR, every session going on without reward once it has ended."""
-    assert steps.model is not None
     sessions = rows_of(steps)
     weights = [1.0] * len(sessions)
     found = {"SNPDIS": 0.0, "SNDR": 0.0}
@@ -82,9 +80,7 @@ def normalised_by_hand(steps: LoggedSteps) -> dict[str, float]:
     st.integers(0, 1000),
     st.sampled_from([1.0, 0.8]),
 )
-def test_the_estimators_are_those_of_a_slow_loop(
-    lengths: list[int], seed: int, discount: float
-) -> None:
+def test_estimators_are_a_slow_loops(lengths: list[int], seed: int, discount: float) -> None:
     steps = random_steps(lengths, seed, discount=discount)
     expected, found = by_hand(steps), estimate(steps, 0)
     kinds = set(IPS_KINDS) | (set(DR_KINDS) if max(lengths) == 1 else set())
@@ -294,7 +290,6 @@ STRENGTHS = {
 @pytest.mark.parametrize("name", STRENGTHS)
 def test_shrinkage_errors_and_choices_agree_with_open_bandit_pipeline(name: str) -> None:
     steps, expected = reference("bandit")
-    assert steps.model is not None
     shrink, doubly_robust = KINDS[name][0], name in DR_KINDS
     left = steps.reward - steps.model.q if doubly_robust else steps.reward
     value = steps.model.v if doubly_robust else np.zeros(len(left))
@@ -356,7 +351,6 @@ def test_where_nothing_spreads_there_is_no_interval() -> None:
 def test_more_clusters_than_are_drawn_from_change_no_error() -> None:
     values = column(np.random.default_rng(0).exponential(size=3 * MOST_CLUSTERS))
     (interval,) = cluster_intervals(values, np.ones_like(values), None, seed=0)
-    assert interval is not None
     expected = values.std() / len(values) ** 0.5
     assert interval.error == pytest.approx(expected, rel=0.03)
     assert interval.high - interval.low == pytest.approx(2 * 1.96 * expected, rel=0.08)

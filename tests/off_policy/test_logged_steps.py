@@ -13,7 +13,6 @@ import pytest
 from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps, Modelled, as_pages, conclude, diagnose, estimate
-from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.logged_steps import ItemGroups, number_pages
 
 LENGTHS = [2, 1, 3] * 20
@@ -64,15 +63,6 @@ def test_missing_propensities_are_unknown(missing: str) -> None:
     np.testing.assert_array_equal(propensity, np.where(unknown, np.nan, values))
 
 
-def test_arrays_of_the_right_type_are_not_copied() -> None:
-    steps = LoggedSteps(
-        STEPS.session, STEPS.reward, STEPS.propensity, STEPS.target, STEPS.model, USER
-    )
-    assert np.shares_memory(steps.user, USER)
-    for name in ("session", "reward", "propensity", "target"):
-        assert np.shares_memory(getattr(steps, name), getattr(STEPS, name)), name
-
-
 def test_rounding_errors_above_one_count_as_one() -> None:
     above = ONES.copy()
     above[4], above[5] = 1.0000000002, 1 + 9e-7
@@ -107,28 +97,16 @@ def few_others(values: Any, other: Any) -> Any:
     ("change", "says"),
     [
         ({"reward": 1.0}, r"reward has shape \(\)"),
-        ({"target": pd.DataFrame({"target": NUMBERS["target"]})}, r"shape \(120, 1\)"),
-        ({"reward": [[1.0], [1.0, 2.0]]}, "reward is no array of numbers"),
         ({"propensity": pd.Series(["n/a"] * 120)}, "propensity is no array of numbers"),
         ({"reward": np.ones(119)}, "reward has 119 values for 120 steps"),
         ({"reward": few_others(ONES, np.nan)}, "reward is not finite at 2 of 120 steps"),
-        ({"reward": np.ma.array(ONES, mask=few_others(ONES == 0, True))}, "finite at 2 of 120"),
-        ({"by_step": few_others(ONES, np.inf)}, "by_step is not finite at 2 of 120 steps"),
         ({"session": STEPS.session + 0.5}, "numbered from 0 in order"),
-        ({"session": STEPS.session[::-1]}, "numbered from 0 in order"),
-        ({"session": STEPS.session * 2}, "numbered from 0 in order"),
-        ({"session": STEPS.session.astype(np.uint8) - np.uint8(1)}, "numbered from 0 in order"),
         ({"session": []}, "there is at least one"),
         ({"user": few_others(USER, np.nan)}, "users are missing, or"),
-        ({"user": pd.Series(["a", 1] * 30)}, "users are missing, or"),
-        ({"user": pd.Series(["a", None] * 30)}, "users are missing, or"),
         ({"user": USER[1:]}, "user has 59 values for 60 sessions"),
         ({"propensity": few_others(ONES, 0)}, "propensities must be above 0 .* 2 of 120 are"),
         ({"propensity": few_others(ONES, 1.5)}, "not a density; .* the first is 1.5"),
-        ({"propensity": few_others(ONES, np.inf), "densities": True}, "the first is inf"),
         ({"target": few_others(ONES, 1.1)}, r"between 0 and 1; 2 of 120 are outside, .* 1\.1$"),
-        ({"target": few_others(ONES, -0.1), "densities": True}, "2 of 120 are outside"),
-        ({"target": few_others(ONES, np.nan)}, "2 of 120 are outside, the first is nan"),
         ({"discount": 0.0}, "above 0 and at most 1"),
         ({"cluster_target": ONES}, "both cluster_propensity and cluster_target"),
         ({"groups": ItemGroups(USER, ONES[:, None])}, "number has 60 values for 120 steps"),
@@ -185,8 +163,6 @@ def test_steps_of_a_page_lie_anywhere_and_keep_their_order() -> None:
     np.testing.assert_array_equal(pages.session, [0, 0, 1, 2, 2, 2])
     np.testing.assert_array_equal(pages.reward, steps.reward[[1, 3, 5, 0, 2, 4]])
     np.testing.assert_array_equal(pages.user, [7, 7, 5])
-    assert pages.model is not None
-    assert steps.model is not None
     np.testing.assert_array_equal(pages.model.q, steps.model.q[[1, 3, 5, 0, 2, 4]])
     pages = as_pages(steps, np.array([0, 1, 0, 1, 0, 1]), np.array([2, 0, 0, 1, 1, 2]))
     np.testing.assert_array_equal(pages.reward, steps.reward[[2, 4, 0, 1, 3, 5]])
@@ -211,23 +187,6 @@ def test_normalised_weights_ignore_the_scale_of_a_position() -> None:
         (ratios * pages.reward)[position == t].sum() / ratios[position == t].sum() for t in range(3)
     )
     assert one["SNIIPS"].value == pytest.approx(expected)
-
-
-def test_influences_of_uneven_pages_are_derivatives() -> None:
-    lengths = np.array([3, 1, 2, 3, 2, 1, 3])
-    page = np.repeat(np.arange(7 * 500), np.tile(lengths, 500))
-    few = random_steps([1] * lengths.sum())
-    many = LoggedSteps(
-        np.arange(len(page)),
-        np.tile(few.reward, 500),
-        np.tile(few.propensity, 500),
-        np.tile(few.target, 500),
-    )
-    pages = as_pages(many, page)
-    above = session_terms(pages)["SNIIPS"].above
-    value, kept = above.mean(), np.arange(len(above)) > 0
-    without = session_terms(pages.select(kept))["SNIIPS"].above.mean()
-    assert (value - without) * kept.sum() == pytest.approx(above[0] - value, rel=0.01, abs=1e-3)
 
 
 def test_sessions_of_several_steps_are_no_positions() -> None:

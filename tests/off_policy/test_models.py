@@ -31,9 +31,7 @@ def inputs_of(steps: int, seed: int) -> StepInputs:
     return StepInputs(*(torch.randn(steps, size, generator=generator) for size in (15, 5, 4, 4, 2)))
 
 
-def test_a_file_gives_back_what_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_gives_back_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     sizes = [3, ROWS_AT_ONCE, 500]
     file = InputsFile(sum(sizes))
@@ -48,9 +46,7 @@ def test_a_file_gives_back_what_was_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_context_is_the_state_the_return_left_and_the_window(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
+def test_context_holds_the_return_left(trained: TrainedPolicy, logged: LoggedSessions) -> None:
     """Two targets differ in the return left, and in what the policy makes of it."""
     seen = []
     for target in (3.0, 5.0):
@@ -69,9 +65,7 @@ def test_context_is_the_state_the_return_left_and_the_window(
     assert not torch.allclose(seen[0].window[:, 1:], seen[1].window[:, 1:])
 
 
-def test_scores_are_of_the_item_and_their_mean_over_what_is_shown(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
+def test_scores_of_the_item_and_of_all(trained: TrainedPolicy, logged: LoggedSessions) -> None:
     """Of an unknown item, the mean; what is all but impossible counts as e^−20."""
     batch = next(score_steps(trained, logged.store, DecisionRule(3.0, temperature=1.0)))
     items = batch.items.clone()
@@ -116,7 +110,6 @@ def test_probabilities_are_those_of_the_logging_policy() -> None:
     assert np.abs(model.group - of_group).mean() < 0.03
     assert model.log_loss < model.share_log_loss - 0.1
     assert model.calibration_error < 0.05
-    assert "held-out loss" in str(model)
 
 
 def test_users_are_predicted_by_models_of_others() -> None:
@@ -144,16 +137,6 @@ def test_unknown_items_are_left_alone(groups: IntArray) -> None:
     np.testing.assert_allclose(model.item[item >= 0], 1 / 9, rtol=0.1)
     if not groups.any():
         np.testing.assert_allclose(model.group, 1)
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_one_user_with_known_items_is_predicted_by_equal_shares() -> None:
-    states, item = behavior()[0][:80], np.arange(80) % 9
-    item[40:] = -1
-    session = np.arange(80) // 40
-    model = fit_behavior(lambda: iter([states]), item, GROUP_OF[item], session, 0)
-    np.testing.assert_allclose(model.group[:40], 1 / 3)
-    np.testing.assert_array_equal(model.group[40:], 1.0)
 
 
 def test_groups_are_the_clusters_of_embeddings() -> None:
@@ -218,7 +201,6 @@ def test_q_is_what_is_still_to_come() -> None:
     report = fitted(noise.astype(np.float32), reward, session, 512)[1]
     assert report.reward_r2 < 0.02
     assert report.td_loss == pytest.approx(reward.var(), rel=0.1)
-    assert f"{report.td_loss:.3g} squared" in str(report)
 
 
 def test_q_that_runs_away_is_stopped_and_said() -> None:

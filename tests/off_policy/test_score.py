@@ -45,11 +45,8 @@ RULES = {
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_scores_are_those_of_an_actor_that_replays_the_session(
-    trained: TrainedPolicy, logged: LoggedSessions, rule: str
-) -> None:
+def test_scores_are_an_actors(trained: TrainedPolicy, logged: LoggedSessions, rule: str) -> None:
     frame = pd.concat(score(trained, logged, RULES[rule]))
-    assert trained.item_ids is not None
     numbers = {item: number for number, item in enumerate(trained.item_ids)}
     assert frame.session.nunique() > 300
     longest = frame.groupby("session").size().nlargest(10).index
@@ -64,7 +61,7 @@ def test_scores_are_those_of_an_actor_that_replays_the_session(
             np.testing.assert_array_equal(rows["rank"], 1 + (thought > chosen[:, None]).sum(1))
 
 
-def test_rows_are_those_of_the_log_in_its_sessions(
+def test_rows_are_the_logs(
     log: pd.DataFrame, trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
@@ -78,9 +75,7 @@ def test_rows_are_those_of_the_log_in_its_sessions(
     assert ((frame["rank"] == 1) == (frame.greedy_item_id == frame.item_id)).all()
 
 
-def test_nothing_of_the_step_or_after_it_is_looked_at(
-    log: pd.DataFrame, trained: TrainedPolicy, read: Read
-) -> None:
+def test_nothing_later_is_looked_at(log: pd.DataFrame, trained: TrainedPolicy, read: Read) -> None:
     """Rewards and items from a step on, changed: it is scored as before."""
     log = log.sort_values(["user_id", "timestamp"])
     gaps = (log.timestamp.diff() > 20 * 60_000) | (log.user_id.diff() != 0)
@@ -100,7 +95,7 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
 
 
 @pytest.mark.parametrize("greedy", [False, True])
-def test_models_are_asked_about_what_the_policy_would_show(
+def test_models_see_the_policy(
     trained: TrainedPolicy, logged: LoggedSessions, greedy: bool
 ) -> None:
     rule = replace(RULE, temperature=0.0) if greedy else RULE
@@ -109,7 +104,6 @@ def test_models_are_asked_about_what_the_policy_would_show(
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
-    assert steps.model is not None
     if greedy:
         # Where the policy would show the logged item, q and v ask the same.
         same = certain.to_numpy() == 1
@@ -117,9 +111,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
         assert not np.allclose(steps.model.q, steps.model.v, atol=1e-3)
 
 
-def test_features_at_the_policy_are_the_mean_over_its_items(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
+def test_features_are_means_over_items(trained: TrainedPolicy, logged: LoggedSessions) -> None:
     batch = next(score_steps(trained, logged.store, RULE))
     at_policy = make_inputs(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
@@ -133,9 +125,7 @@ def test_features_at_the_policy_are_the_mean_over_its_items(
     np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
 
 
-def test_items_the_run_does_not_know_are_counted(
-    log: pd.DataFrame, trained: TrainedPolicy, read: Read
-) -> None:
+def test_unknown_items_are_counted(log: pd.DataFrame, trained: TrainedPolicy, read: Read) -> None:
     strange = log.head(4).assign(item_id=[991, 992, 993, 993])
     with read(pd.concat([log, strange])) as logged:
         assert logged.report["dropped"]["unknown_item"] == 4
@@ -279,7 +269,6 @@ def test_a_run_that_was_moved_with_its_store_finds_it(
         assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
     record = trained.record.copy_with(store=str(tmp_path / "gone"))
     found = store_of(tmp_path / "run", record)
-    assert found is not None
     assert found.path == (tmp_path / "store").resolve()
     (tmp_path / "store").rename(tmp_path / "elsewhere")
     assert store_of(tmp_path / "run", record) is None

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +77,10 @@ def test_estimates_are_those_from_the_logs(
 
 
 def rewrite(file: Path, column: str, values: Any) -> None:
-    """Replace the values of a column in some rows of a file, or cast them."""
+    """Replace the values of a column in some rows of a file."""
     table = pq.read_table(file)
-    changed = table[column].to_numpy().astype(values if isinstance(values, type) else np.float64)
-    if not isinstance(values, type):
-        changed[9:11] = values
+    changed = table[column].to_numpy().astype(np.float64)
+    changed[9:11] = values
     table = table.set_column(table.schema.get_field_index(column), column, pa.array(changed))
     pq.write_table(table, file)
 
@@ -90,21 +88,15 @@ def rewrite(file: Path, column: str, values: Any) -> None:
 @pytest.mark.parametrize(
     ("column", "values", "says"),
     [
-        ("session", float, None),
         ("session", -1, "part-2.* not numbered in order"),
         ("reward", math.inf, r"part-2\.parquet: reward is not finite at 2 of "),
         ("propensity", 0.0, r"part-2\.parquet: propensities must be above 0 .*; 2 of "),
         ("probability", 1e300, "lie between 0 and 1; 2 of .*, the first is 1e\\+300"),
-        ("probability", math.nan, "2 of .* are outside, the first is nan"),
-        ("probability", 1.0000000002, None),
         ("session", None, "part-2.* has no column session"),
-        ("bytes", None, "part-2.* cannot be read"),
         ("content", None, "part-2.* is damaged"),
         ("twice", None, "not numbered in order"),
-        ("log", None, "has no column session, probability"),
         ("rule", None, r"part-0\.parquet was scored with rule '.*', not '"),
         ("pages", True, "need the logs"),
-        ("reward_range", (0.0, 1.0), "need the logs"),
     ],
 )
 def test_scored_rows_that_cannot_be_used_are_refused(
@@ -115,21 +107,17 @@ def test_scored_rows_that_cannot_be_used_are_refused(
     monkeypatch: pytest.MonkeyPatch,
     column: str,
     values: Any,
-    says: str | None,
+    says: str,
 ) -> None:
     monkeypatch.setattr(scored, "_BATCH_ROWS", 7)
     parts = scored_parts(log, trained, read, tmp_path, 0)
     file, rule, options = parts / "part-2.parquet", RULE, EstimateOptions()
-    if column in ("pages", "reward_range"):
-        options = EstimateOptions(**{column: values})
+    if column == "pages":
+        options = EstimateOptions(pages=values)
     elif column == "rule":
         rule = DecisionRule(7.5)
-    elif column == "log":
-        parts = tmp_path / "log.parquet"
     elif column == "twice":
         shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
-    elif column == "bytes":
-        file.write_bytes(b"no Parquet")
     elif column == "content":
         content = bytearray(file.read_bytes())
         content[100:400] = bytes(300)
@@ -138,7 +126,7 @@ def test_scored_rows_that_cannot_be_used_are_refused(
         pq.write_table(pq.read_table(file).drop_columns([column]), file)
     else:
         rewrite(file, column, values)
-    with nullcontext() if says is None else pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=says):
         evaluate_scored(trained, [parts], rule=rule, seed=0, options=options)
 
 

@@ -154,8 +154,3 @@ def test_names_say_what_differs() -> None:
     assert names_of(candidates)[3] == "target return 2.5, b"
     assert names_of(candidates[:1]) == ["x"]
     assert names_of([{"run": "x", "rule": "a"}, {"run": "y", "rule": "a"}]) == ["x", "y"]
-    close = [{"run": "x", "target return": t} for t in (1000001.0, 1000002.0, None)]
-    named = [*(f"target return {t}" for t in (1000001, 1000002)), "largest target return expected"]
-    assert names_of(close) == named
-    closest = [{"target return": t} for t in (0.1 + 0.2, 0.3, 0.25)]
-    assert len(set(names_of(closest))) == 3

@@ -68,7 +68,6 @@ def test_sessions_needed_are_enough_four_times_in_five() -> None:
     steps, _ = logs(5000)
     wanted = value() - PAYS.mean()
     needed = conclude(steps, seed=0, wanted_lift=wanted).sessions_needed
-    assert needed is not None
     found = 0
     for seed in range(100):
         low = conclude(logs(needed, seed)[0], seed).lift_low
@@ -136,7 +135,6 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     diagnosis = diagnose(steps, reward_range=(0, 1))
     failed = {test.name for test in diagnosis.tests if not test.passed}
     assert failed >= {"step 1", "step 10", "session products"}
-    assert diagnosis.bounds is not None
     assert diagnosis.bounds[0] < truth < diagnosis.bounds[1]
     verdict = conclude(steps, seed=0, diagnosis=diagnosis)
     assert not verdict.reliable
@@ -146,20 +144,6 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     filtered = str(conclude(steps, seed=0, diagnosis=diagnosis, filter_seen=True))
     assert "evaluate with --filter-seen" not in filtered
     assert "items that requests excluded by candidates" in filtered
-
-
-def test_a_mean_weight_that_is_off_by_chance_is_not_blamed_on_the_logs_alone() -> None:
-    """Over many steps nearly all weight is in sessions too rare to be drawn."""
-    for seed in range(20):
-        steps, _ = logs(1500, seed, length=12)
-        steps = replace(steps, target=(steps.target * ITEMS) ** 2 / (TARGET**2).sum() / ITEMS**2)
-        failed = [test for test in diagnose(steps).tests if not test.passed]
-        if [test.name for test in failed] == ["session products"] and failed[0].mean < 1:
-            said = str(conclude(steps, seed=0))
-            assert "too rare in these logs: give more logs" in said
-            assert "filter-seen" not in said
-            return
-    pytest.fail("no sample has sessions of the policy too rare")
 
 
 def test_weights_are_tested_by_segment() -> None:
@@ -179,7 +163,6 @@ def test_the_step_at_which_the_logs_stop_telling() -> None:
     steps, _ = logs(2000, length=20)
     diagnosis = diagnose(steps)
     stops = diagnosis.unsupported_from_step
-    assert stops is not None
     assert 4 < stops < 20
     assert all(n >= 200 for n in diagnosis.effective_by_step[: stops - 1])
     assert diagnosis.effective_by_step[stops - 1] < 200
@@ -204,7 +187,6 @@ def test_heavy_tails_are_noticed(sigma: float, heavy: bool) -> None:
         target=np.full(5000, 1e-6),
     )
     tail = diagnose(steps).tail
-    assert tail is not None
     assert (tail > 0.5) is heavy
     assert any("heavy a tail" in line for line in conclude(steps, seed=0).reasons) is heavy
 
@@ -238,11 +220,9 @@ def test_propensities_imply_how_many_items_there_are(factor: float, items: float
     steps = random_steps([1] * 20_000)
     steps = replace(steps, propensity=np.minimum(shares[item] * factor, 1))
     found = check_catalogue_size(steps, np.ones(20_000, dtype=bool), 20)
-    assert found is not None
     assert found.mean * 20 == pytest.approx(items, rel=0.05)
     assert found.passed is (factor >= 1)
     half = check_catalogue_size(steps, item < 10, 10)
-    assert half is not None
     assert half.mean == pytest.approx(items / 20, rel=0.05)
     # Few users, and no propensities, imply nothing.
     listed = np.ones(20_000, dtype=bool)
@@ -271,7 +251,6 @@ def test_wrong_propensities_of_one_group_are_found() -> None:
     tests = {test.name: test for test in diagnose(steps).tests}
     assert tests["item group 0"].passed
     assert tests["item group 1"].passed
-    assert steps.groups is not None
     factor = np.where(steps.groups.number == 0, 1.25, 1 / 1.2)
     wrong = replace(steps, propensity=steps.propensity * factor)
     failed = {test.name: test.mean for test in diagnose(wrong).tests if not test.passed}

@@ -74,9 +74,7 @@ def test_a_store_its_logs_and_a_frame_of_them_train_the_same_policy(
     pd.testing.assert_frame_equal(policy.recommend(log), fitted.recommend(log))
 
 
-def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
-    log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_runs_stay(log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scratch, work = tmp_path / "scratch", tmp_path / "work"
     scratch.mkdir()
     work.mkdir()
@@ -128,7 +126,7 @@ def test_folders_are_found_from_any_folder(
     assert (tmp_path / "other" / "copy" / "run.json").is_file()
 
 
-def test_copies_share_a_temporary_run_and_a_pickle_has_none(
+def test_copies_and_pickle(
     log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -156,7 +154,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_the_run_of_a_killed_process_is_removed_by_the_next_fit(
+def test_killed_runs_are_removed(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = subprocess.run(
@@ -214,13 +212,10 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
     store = folder / "store"
     for data, options, message in (
         (store, {"reward": "reward"}, "is prepared already"),
-        (EpisodeStore.open(store), {"gap_minutes": 3.0}, "is prepared already"),
-        (store, {"mapping": LogMapping({"user_id": "uid"})}, "is prepared already"),
         (folder / "nothing", {}, "nothing does not exist"),
         ([1, 2], {}, r"data is \[1, 2\]; give a pandas DataFrame"),
         (log.head(0), {}, "data: the frame has no rows"),
         (log.drop(columns="item_id"), {}, "no column 'item_id'"),
-        (log, {"reward": "is_click"}, "no column 'is_click'"),
         (log, {"session_by": "day"}, "session_by is 'day'"),
         (log, {"session_by": "user", "gap_minutes": 3}, "gap_minutes is 3, but sessions are those"),
         (log.assign(session_id=1), {"gap_minutes": 3}, "session_by='session_id'; leave it out"),
@@ -235,17 +230,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
             use()
 
 
-def test_a_recommender_says_what_it_was_trained_on(fitted: Recommender) -> None:
-    record = fitted.trained.record
-    steps, episodes = record.train_steps, record.train_episodes
-    facts = f"'dt', trained on {steps:,} steps, {episodes:,} episodes, 30 items, reward=reward"
-    assert repr(fitted) == f"Recommender({facts})"
-    assert repr(fitted.trained) == f"TrainedPolicy({facts})"
-
-
-def test_a_loaded_policy_is_the_one_saved(
-    fitted: Recommender, log: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_a_policy_saved_and_loaded(fitted: Recommender, log: pd.DataFrame, tmp_path: Path) -> None:
     fitted.save(tmp_path / "copy")
     loaded = UCF.load(tmp_path / "copy")
     assert loaded.config == fitted.config
@@ -321,9 +306,7 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
     assert "ucfrec ope" in card
 
 
-def test_later_logs_may_be_files_and_the_test_split(
-    fitted: Recommender, folder: Path, log: pd.DataFrame
-) -> None:
+def test_later_logs_may_be_files(fitted: Recommender, folder: Path, log: pd.DataFrame) -> None:
     from_files = fitted.rank(folder / "log-*.parquet", k=3).to_frame()
     from_frame = fitted.rank(log, k=3).to_frame()
     numbers = [name for name in from_frame.select_dtypes("number") if name != "wall_time_s"]
@@ -391,27 +374,17 @@ def test_it_follows_scikit_learns_conventions(fitted: Recommender) -> None:
     assert policy.config.train.steps == 9
     loaded = Recommender.load(fitted.run)
     assert clone(loaded).config == fitted.config
-    assert policy.set_params(policy="bc", settings={}).config.policy_name == "bc"
-
-
-def test_another_policy_keeps_the_settings_that_it_has(fitted: Recommender) -> None:
-    loaded = Recommender.load(fitted.run)
-    assert loaded.config == fitted.config
-    loaded.set_params(policy="bc")
-    assert loaded.config.policy_name == "bc"
+    loaded.set_params(policy="bc")  # keeps the settings that it has
     assert loaded.config.train == fitted.config.train
-    assert loaded.config.policy.dim == fitted.config.policy.dim
-    layered = Recommender("dt", settings=["policy.layers=2", "policy.dim=8"])
-    assert layered.set_params(policy="bc").config.policy.dim == 8
     with pytest.raises(InputError, match="policy has no field 'layers'"):
         Recommender("dt").set_params(policy="bc", policy__layers=2)
+    assert policy.set_params(policy="bc", settings={}).config.policy_name == "bc"
 
 
 def test_new_logs_bring_it_up_to_date(log: pd.DataFrame, tmp_path: Path) -> None:
     policy = Recommender("dt", settings=[*SMALL, "rule.sessions=3"]).fit(log[:1000])
     new = policy.update(log[1000:], tmp_path / "new")
     update = new.trained.record.update
-    assert update is not None
     assert update.appended["steps"] == 500
     assert update.verdict is not None
     assert new.run == tmp_path / "new"
@@ -432,30 +405,17 @@ FRAME = "give a pandas DataFrame"
 SIM = "synthetic-catalog"
 WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     f"seed is -1; {SEED}": lambda *_: Recommender(seed=-1),
-    f"seed is 1099511627776; {SEED}": lambda p, log: p.ope(log, seed=2**40),
     f"seed is 1.5; {SEED}": lambda p, log: p.recommend(log, seed=1.5),
-    f"seed is -2; {SEED}": lambda p, log: p.rank(log, seed=-2),
     "k is 0; give a whole number, 1 or more": lambda p, log: p.rank(log, k=0),
-    "k is '3'; give a whole number": lambda p, log: p.rank(log, k="3"),
-    "k is None; give a whole number": lambda p, _: p.recommend_to_items(k=None),
-    "k is 2.0; give a whole number": lambda p, _: p.export("no", k=2.0),
     "^k is 99; the run has 30 items": lambda p, _: p.export("no", k=99),
     "users is 7; give a list of user_ids": lambda p, _: p.recommend(users=7),
-    "users is '7'; give a list of user_ids": lambda p, _: p.recommend(users="7"),
-    "users is empty or nested; give a list": lambda p, _: p.recommend(users=[]),
-    "users is a value of type DataFrame; give a list of user_ids": (
-        lambda p, log: p.recommend(log, users=log[["user_id"]])
-    ),
     "items is 5; give a list of item_ids": lambda p, _: p.recommend_to_items(5),
-    "items is '5'; give a list": lambda p, _: p.recommend_to_items("5"),
     "settings is None; give a list of texts": lambda *_: Recommender(settings=None),
-    "settings has 3; give texts": lambda *_: Recommender(settings=[3]),
     r"no policy is called \['dt'\]; choose from": lambda *_: Recommender(["dt"]),
     "gap_minutes is '30'; give a fin": lambda p, log: p.fit(log, gap_minutes="30"),
     "split is 0.8; give three shares or two": lambda p, log: p.fit(log, split=0.8),
     "split '1,x': write shares as .* ISO": lambda p, log: p.fit(log, split=(1, "x")),
     "reward is 1; give text": lambda p, log: p.fit(log, reward=1),
-    r"reward is \['r'\]; give text": lambda p, log: p.fit(log, reward=["r"]),
     "on_step is 3; give a function": lambda p, log: p.fit(log, on_step=3),
     "out is 3; give a path": lambda p, log: p.fit(log, 3),
     "mapping is {'user_id': 3}; give a LogMapping, a TOML file, or a dic": (
@@ -470,9 +430,7 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     "episodes is '50'; give a whole number, 1 or more": lambda p, _: p.evaluate(SIM, "50"),
     "behaviors has 3; give the name of a": lambda p, _: p.evaluate(SIM, 5, behaviors=3),
     "window_days is '3'; give a finite": lambda p, log: p.update(log, "no", window_days="3"),
-    "window_days is nan; give a finite": lambda p, log: p.update(log, "no", window_days=np.nan),
     f"logs is None; {FRAME}": lambda p, _: p.score(None),
-    f"histories is 3; {FRAME}": lambda p, _: p.recommend(3),
     "rule is 'greedy'; give a De": lambda p, log: p.recommend(log, rule="greedy"),
     r"options is {'discount': 0\.9}; give EstimateOptions": (
         lambda p, log: p.ope(log, options={"discount": 0.9})
@@ -492,13 +450,8 @@ def test_wrong_arguments_are_named(rated: Recommender, shown: pd.DataFrame, mess
         WRONG[message](rated, shown)
 
 
-def test_numpys_integers_and_any_list_of_ids_are_taken(
-    rated: Recommender, shown: pd.DataFrame
-) -> None:
+def test_numpys_integers_and_any_list_of_ids(rated: Recommender, shown: pd.DataFrame) -> None:
     one = np.int64(1)
-    assert (
-        Recommender("item-rate", seed=np.int64(3)).config == Recommender("item-rate", seed=3).config
-    )
     drawn = rated.recommend(shown, k=np.int64(2), rule=RULE, seed=one)
     pd.testing.assert_frame_equal(drawn, rated.recommend(shown, k=2, rule=RULE, seed=1))
     assert rated.rank(shown, k=one, seed=one).rows[0].conditions["k"] == 1
@@ -507,9 +460,7 @@ def test_numpys_integers_and_any_list_of_ids_are_taken(
         assert set(rated.recommend(users=users, k=1).user_id) == {7, 8}
 
 
-def test_names_of_columns_one_recommender_and_one_behavior_are_enough(
-    rated: Recommender, shown: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_names_of_columns_suffice(rated: Recommender, shown: pd.DataFrame, tmp_path: Path) -> None:
     renamed, names = shown.rename(columns={"user_id": "uid"}), {"user_id": "uid"}
     again = Recommender("item-rate").fit(renamed, reward="reward", session_by="user", mapping=names)
     (tmp_path / "log.toml").write_text('[columns]\nuser_id = "uid"\n')

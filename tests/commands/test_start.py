@@ -89,3 +89,21 @@ def test_what_works_on_a_run_imports_what_it_uses() -> None:
     assert len(found) == len(USED)
     for each, used in zip(found, USED.values(), strict=True):
         assert each & SLOW_TO_IMPORT <= used | {"pydantic"}
+
+
+def test_weights_are_loaded_without_the_compiler() -> None:
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "import torch\n"
+        "from ucfrec.episodes.exposure import ExposureTerm, Likeness\n"
+        "from ucfrec.fitting.checkpoint import load_module\n"
+        "from ucfrec.policies.base import embedding\n"
+        "def build():\n"
+        "    return torch.nn.ModuleList(\n"
+        "        [embedding(3, 2), ExposureTerm(2, 3, Likeness(3, 2, 0))])\n"
+        "load_module(Path('weights'), build, build().state_dict())\n"
+        "print('', *sys.modules, file=sys.stderr)\n"
+    )
+    (found,) = modules(code)
+    assert not found & {"torch._dynamo", "sympy", "scipy.stats", "boto3"}

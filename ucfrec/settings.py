@@ -230,7 +230,8 @@ def shown(value: object) -> str:
 
 
 def require_whole(name: str, value: object, least: int = 1, most: int | None = None) -> int:
-    """The whole number, NumPy's too, that `value` is, at least `least` and at most `most`."""
+    """The whole number, NumPy's too, that `value` is; InputError if it is none, below `least` or
+    above `most`."""
     try:
         whole = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:

@@ -83,6 +83,9 @@ def gauc(scored: pd.DataFrame) -> float:
     """Probability that a liked item scores higher than another one shown to the same user, mean
     over users weighted by rows; users with liked items only, or with none, do not count. `scored`
     has `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
+
+    Raises:
+        InputError: a column or a score is missing, there are no rows, or `liked` is something else.
     """
     _require(scored, "scored", [USER_ID, "score", "liked"])
     if unusable := (~scored["liked"].isin([0, 1])).sum():

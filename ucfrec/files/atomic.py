@@ -56,7 +56,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
 
-    Of two processes that write one file, the second waits for the first.
+    Of two processes that write one file, the second waits for the first. InputError if `path` is a
+    folder.
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
@@ -97,7 +98,8 @@ def scratch_of(path: Path) -> Path:
 
 
 def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that files to write are none of those to read, and differ from each other."""
+    """Check that files to write are none of those to read, and differ from each other; InputError
+    if not."""
     taken = {path.resolve() for path in inputs}
     for path in written:
         if path.resolve() in taken:

@@ -70,7 +70,8 @@ def require_plausible_size(path: Path) -> None:
 
 
 def read_ids(path: Path, column: str) -> Array:
-    """The ids in a column of a Parquet file, (n,) int64 or text."""
+    """The ids in a column of a Parquet file, (n,) int64 or text; InputError if it has other values,
+    lacks some, or cannot be read."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -25,7 +25,8 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write named tensors and metadata that JSON can represent, atomically."""
+    """Write named tensors and metadata that JSON can represent, atomically; InputError if there is
+    no space."""
     plain: dict[str, Tensor] = {}
     places = set()
     for name, tensor in tensors.items():
@@ -50,7 +51,8 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote."""
+    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote; InputError if the
+    file is missing or damaged."""
     # safetensors may call whatever it cannot read a missing file.
     require_file(path, REMEDY)
     try:
@@ -66,7 +68,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
     """Build a module and load `tensors` into it, which were read from `path`.
 
     The sizes of a module come from a record that may state any. They are compared with those of the
-    tensors, which a file holds, before memory is allocated.
+    tensors, which a file holds, before memory is allocated. Errors as of `load_weights`.
     """
     try:
         with torch.device("meta"):
@@ -147,6 +149,9 @@ def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
     Returns:
         {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
         if the file does not exist.
+
+    Raises:
+        InputError: a line is not an object of a step and numbers.
     """
     path = folder / METRICS
     if not path.exists():

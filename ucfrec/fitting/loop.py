@@ -288,7 +288,8 @@ class _Training:
 
 
 def load_trained(path: Path) -> dict[str, Tensor]:
-    """The trained weights in a file of `fit`: averages where it has them, and nothing else."""
+    """The trained weights in a file of `fit`: averages where it has them, and nothing else;
+    InputError if it is missing or damaged."""
     tensors, counters = load_tensors(path)
     weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, _AVERAGE))}
     with damage_explained(path, REMEDY):

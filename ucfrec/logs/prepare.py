@@ -173,7 +173,8 @@ def prepare(
 def validate(
     paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
-    """Check the logs as `prepare` does, without writing a store; returns its report."""
+    """Check the logs as `prepare` does, without writing a store; returns its report, or raises its
+    InputError."""
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
     with read_log(log_files(paths), mapping, options, spill) as log:

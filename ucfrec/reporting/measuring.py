@@ -41,6 +41,9 @@ def rank_policies(
         liked: condition on the reward; None for the run's own.
         seed: of the bootstrap over users and of the random baseline.
         checkpoint: name of the policies' weights, here and below.
+
+    Raises:
+        InputError: `liked` cannot be used.
     """
     from ucfrec.evaluation.ranking import Later, LikedExpression
     from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
@@ -87,6 +90,9 @@ def estimate_return(
     Args:
         logs: their names in the model card.
         seed: of the folds and the bootstrap.
+
+    Raises:
+        InputError: the logs cannot be used.
     """
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.score import LoggedSessions

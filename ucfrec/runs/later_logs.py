@@ -21,6 +21,9 @@ def later_logs(
     Args:
         paths: files, folders and globs.
         stated: what the caller says of the columns.
+
+    Raises:
+        InputError: a path is missing, or holds no log of the dataset.
     """
     source = trained.record.data
     # A record may also name a dataset that is not read by an adapter.

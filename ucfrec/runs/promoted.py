@@ -33,14 +33,14 @@ class Promoted(Record):
     previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
 
     def run(self, folder: Path) -> Path:
-        """The folder of the current run, which must lie beside the file."""
+        """The folder of the current run; InputError if it does not lie beside the file."""
         if self.current in ("", ".", "..") or Path(self.current).name != self.current:
             raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
         return folder / self.current
 
 
 def promoted(folder: Path) -> Promoted | None:
-    """What the pointer file of a folder says; None if there is none."""
+    """What the pointer file of a folder says, None without one; InputError if it is damaged."""
     return Promoted.read(folder) if (folder / POINTER).is_file() else None
 
 

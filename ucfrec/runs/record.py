@@ -265,7 +265,7 @@ class RunRecord(TrainingRecord):
 
     @property
     def finished(self) -> Fit:
-        """The report of the policy's training, which must have ended."""
+        """The report of the policy's training; InputError if it has not ended."""
         if self.policy is None:
             raise InputError("the training of the run has not ended; train it to its end first")
         return self.policy
@@ -317,7 +317,8 @@ class RunRecord(TrainingRecord):
 
 
 def read_record(run: Path) -> RunRecord:
-    """The record of a run, whose small files are compared with their checksums."""
+    """The record of a run, whose small files are compared with their checksums; InputError if it is
+    damaged, or no run folder."""
     record = RunRecord.read(run)
     record.require(run, small=SMALL)
     return record
@@ -336,13 +337,15 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:
-    """The decision rules that the choice of a run tried; none if it did not choose."""
+    """The decision rules that the choice of a run tried; none if it did not choose. InputError if
+    they are damaged."""
     path = run / CANDIDATES
     return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
 
 
 def read_augmentation(path: Path) -> AugmentationReport:
-    """The report of an augmentation that is made, of a run that may still be in training."""
+    """The report of an augmentation that is made, of a run that may still be in training;
+    InputError if it is damaged."""
     return _read_stage(path, AugmentationReport)
 
 
@@ -363,7 +366,7 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
     """The store that a run was trained on; None where it is gone or changed.
 
     It is looked for where it lies as seen from the run, so that both can be moved or copied
-    together, and where it lay when the run was trained.
+    together, and where it lay when the run was trained. InputError if it is damaged.
     """
     seen_from_run = os.path.normpath(run.resolve() / (record.store_from_run or record.store))
     for path in (Path(seen_from_run), Path(record.store)):
@@ -375,7 +378,8 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
 
 
 def verify_run(run: Path) -> None:
-    """Read every file of a finished run and compare it with its checksum."""
+    """Read every file of a finished run and compare it with its checksum; InputError if one has
+    another, or the run is not finished."""
     record = read_record(run)
     if record.policy is None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")

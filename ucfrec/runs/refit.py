@@ -72,7 +72,8 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
 def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
     """`refit` a run into its own folder, which then acts by the new weights; made once.
 
-    A refit of other weights than those of the run is made again.
+    A refit of other weights than those of the run is made again. InputError if the run is not
+    finished.
     """
     out = run / REFIT
     if (out / RUN).exists():

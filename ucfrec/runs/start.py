@@ -63,7 +63,8 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
 
 
 def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
-    """Check that a run can begin, or go on, in the folder `out`; see `train_run`."""
+    """Check that a run can begin, or go on, in the folder `out`; InputError if it holds another, or
+    if rewards never vary, which augmentation needs."""
     if not (out / RUN).exists():
         if config.augment.augments:
             require_rewards_vary(train)

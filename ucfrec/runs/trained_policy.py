@@ -204,13 +204,14 @@ class TrainedPolicy:
         return store
 
     def target_return(self, quantile: float) -> float:
-        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units."""
+        """The `quantile` of `training_returns`, exact, in reward units; InputError if it is not
+        from 0 to 1."""
         if not 0 <= quantile <= 1:
             raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
     def scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """The policy under `rule`, by default the run's own, which it must fit.
+        """The policy under `rule`, by default the run's own; InputError if it does not fit.
 
         What it computes once is kept for the next call with the same weights.
         """
@@ -276,7 +277,7 @@ class TrainedPolicy:
 
 
 def read_rule(path: Path) -> DecisionRule:
-    """The decision rule in a file of a run."""
+    """The decision rule in a file of a run; InputError if it holds something else."""
     return DecisionRule.from_dict(read_json(path), str(path))
 
 
@@ -308,7 +309,8 @@ class RunOnWorkers:
 
     @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:
-        """The policy; kept for the next task of this worker."""
+        """The policy, kept for the next task of this worker; InputError if the folder holds no or
+        another run."""
         # A worker has one core; the cluster runs as many workers as it has cores.
         torch.set_num_threads(1)
         trained = TrainedPolicy.load(self.folder, self.checkpoint)

@@ -249,12 +249,12 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
 
     connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
     connection.execute(
-        f"CREATE TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, user_code, split, "
+        f"CREATE TEMP TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, user_code, split, "
         "steps, begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
     )
     connection.execute(
         f"""
-        CREATE TABLE {USED_USERS} AS
+        CREATE TEMP TABLE {USED_USERS} AS
         SELECT {schema.USER_ID}, code, steps, train_count, longest, ended FROM user_codes JOIN (
             SELECT user_code AS code, CAST(sum(steps) AS BIGINT) AS steps, max(steps) AS longest,
                 arg_max(terminated, episode) AS ended,

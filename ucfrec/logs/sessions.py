@@ -249,8 +249,9 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
 
     connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
     connection.execute(
-        f"CREATE TEMP TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, user_code, split, "
-        "steps, begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
+        f"CREATE TEMP TABLE {EPISODES} AS "
+        "SELECT row_number() OVER () - 1 AS episode, user_code, split, steps, "
+        "begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
     )
     connection.execute(
         f"""

@@ -233,6 +233,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
 def test_a_policy_saved_and_loaded(fitted: Recommender, log: pd.DataFrame, tmp_path: Path) -> None:
     fitted.save(tmp_path / "copy")
     loaded = UCF.load(tmp_path / "copy")
+    assert loaded.trained.record.refit_of is None, "fit keeps the weights of the training rows"
     assert loaded.config == fitted.config
     assert repr(loaded) == repr(fitted)
     pd.testing.assert_frame_equal(loaded.recommend(log), fitted.recommend(log))

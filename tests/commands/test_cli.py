@@ -251,7 +251,7 @@ ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
 ELSEWHERE = {
     "demo": "commands/test_demo.py",
     "serve": "recommending/test_web.py",
-    "explore": "exploring/test_page.py",
+    "explore": "exploring/test_explain.py",
     "datasets": "datasets/test_movielens.py",
 }
 """Files of tests that compare other commands with Python."""
@@ -305,6 +305,7 @@ def test_a_command_does_what_the_python_api_does(
 
 def test_every_command_is_compared_with_python() -> None:
     assert {*ALIKE, *ELSEWHERE} == {*UCFREC.commands}
+    assert all((ROOT / "tests" / file).is_file() for file in ELSEWHERE.values())
 
 
 def _content(path: Path) -> object:

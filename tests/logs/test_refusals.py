@@ -16,7 +16,6 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files, read_column
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 
 Act = Callable[[Path], Any]
-Change = Callable[[pd.DataFrame], pd.DataFrame]
 
 
 def refuse(act: Act, folder: Path, message: str) -> None:

@@ -432,7 +432,7 @@ def _describe_choice(users: UserModel) -> str:
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
-    """Rules of all kinds that the log can tell of, each beside the best of those before."""
+    """Simulate candidates part by part of the rule, varying the best rule found so far."""
     problem, config = search.problem, search.problem.config
     drawn = (DecisionRule(None, temperature=t) for t in sorted(config.temperatures, reverse=True))
     candidates = search.simulate([rule for of in drawn for rule in _vary_target(of, problem)])

@@ -94,10 +94,10 @@ class Evidence:
     likelihood: float
     """Geometric mean of the probabilities with which the rule shows what was logged."""
     effective_users: float | None = None
-    """Users of equal weight that say as much of the rule as the logged ones, weighted; twice those
-    of the half with fewer; None without propensities."""
+    """Effective sample size in users under importance weights: twice that of the half of the log
+    with the smaller one; None without propensities."""
     spread: float = 0.0
-    """Variance of the logarithms of the sessions' weights that are not 0, i.e. their tail."""
+    """Variance of the log weights of sessions that are not 0: how heavy the tail is."""
     value: float | None = None
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None

@@ -53,7 +53,7 @@ _ACTION_STREAM = 1
 """Keeps the draws of actions apart from others with the same seed."""
 _DELTA_LEVEL = "0.95"
 _LESS = 1 - 1e-9
-"""Of a gate, so that rounding opens none."""
+"""Factor of a gate's limits, so that a rounding error does not let a proposal pass."""
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _BINS = 20
 _Edits = tuple[IntArray, IntArray, IntArray, Float32Array]

@@ -46,8 +46,9 @@ class AppendOptions:
     """Sessions that ended longer ago than this, before the end of the new logs, are left out; None
     keeps all."""
     split: tuple[float, ...] = SPLIT
-    """As of `PrepareOptions`, of the new rows; so is the next."""
+    """As of `PrepareOptions`, of the new rows."""
     memory_limit: str = "2GB"
+    """As of `PrepareOptions`."""
 
 
 def append_logs(

@@ -188,7 +188,7 @@ class Design:
         return self.inputs(name).square().T @ vectors
 
     def inputs(self, name: str) -> Tensor:
-        """What the effects `name` of numbers that are the same for all items multiply."""
+        """The inputs (M, …) that the effect `name` multiplies, the same for all items of a row."""
         return {"exposure": self.exposure, "context": self.observed}.get(name, self.x)
 
     @property

@@ -42,8 +42,8 @@ def damage_explained(path: Path | str, remedy: str) -> Iterator[None]:
 
 
 _FAULTS = (
-    *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
-    *(RuntimeError, RecursionError, ZeroDivisionError),
+    *(LookupError, TypeError, ValueError, AttributeError, OverflowError),
+    *(RuntimeError, ZeroDivisionError),
 )
 """What using values of another type, shape or range raises."""
 

@@ -3,9 +3,12 @@ the best settings as TOML, and a page of all trials."""
 
 import json
 import math
+import shlex
 import shutil
+import sqlite3
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +19,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.files.atomic import atomic_file, lock_path
@@ -44,6 +47,7 @@ _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
 _OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
+_REMEDY: Final = "restore it, or name another folder"
 _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
@@ -91,11 +95,6 @@ class Plan:
     prune: bool = True
     """Whether trials are ended early whose validation loss is above the median of the others'."""
 
-    @property
-    def stored(self) -> dict[str, str]:
-        """Address of the study's SQLite file, and the name of the study, for Optuna."""
-        return {"storage": f"sqlite:///{self.out / STUDY}", "study_name": "ucfrec"}
-
 
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
@@ -105,9 +104,9 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
 
     Raises:
         InputError: the folder holds another search, the numbers are out of range, the policies have
-            no such metric on this store, or no trial could be measured.
+            no such metric on this store, no trial could be measured, or the study's file is damaged
+            or cannot be written.
     """
-    optuna = _optuna()
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
     store = EpisodeStore.open(plan.store)
@@ -119,12 +118,11 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
                 f"{store.path}: {policy} has no estimated value there, because its decision rule "
                 f"is not selected in simulated sessions; {_OTHER_METRICS}"
             )
-    with lock_path(plan.out, "tuned"):
-        plan.out.mkdir(parents=True, exist_ok=True)
-        study: Study = optuna.create_study(**plan.stored, direction="maximize", load_if_exists=True)
-        _require_same(study, plan, store)
-        _enqueue_again(study)
-        left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
+    with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
+        with damage_explained(plan.out / STUDY, _REMEDY):
+            _require_same(study, plan, store)
+            _enqueue_again(study)
+            left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
         if len(shares) == 1:
             _run_trials(plan, shares[0], seed)
@@ -152,12 +150,40 @@ def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
     return plan.search.config(policy, values)
 
 
-def _optuna() -> Any:
+@contextmanager
+def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
+    """The study of a folder, new if it has none, while it is used; errors of its file become an
+    `InputError`.
+
+    Args:
+        seed: of what its trials draw.
+    """
     import optuna
+    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    return optuna
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / STUDY
+    # In a URL, some characters of the path would have a meaning.
+    connect = partial(sqlite3.connect, file, check_same_thread=False)
+    try:
+        with damage_explained(file, _REMEDY):
+            storage = optuna.storages.RDBStorage("sqlite:///file", {"creator": connect})
+            study = optuna.create_study(
+                storage=storage,
+                sampler=optuna.samplers.TPESampler(seed=seed),
+                study_name="ucfrec",
+                direction="maximize",
+                load_if_exists=True,
+            )
+        yield study
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        reason = str(error.__cause__ or error).partition("\n")[0]
+        raise InputError(
+            f"{file} cannot be read or written ({reason:.200}); free space on its disk, or "
+            f"{_REMEDY}"
+        ) from None
 
 
 def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
@@ -201,36 +227,43 @@ def _enqueue_again(study: "Study") -> None:
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
-    optuna = _optuna()
-    # A search that goes on must not draw the first points once more.
-    sampler = optuna.samplers.TPESampler(seed=seed)
-    study = optuna.load_study(**plan.stored, sampler=sampler)
-    objective = partial(_objective, plan, EpisodeStore.open(plan.store))
-    study.optimize(objective, n_trials=count, catch=(InputError,))
+    from optuna import TrialPruned
+    from optuna.trial import TrialState
+
+    store = EpisodeStore.open(plan.store)
+    # With the seed of the search, one that goes on would draw the first points once more.
+    with _open_study(plan.out, seed) as study:
+        for _ in range(count):
+            trial = study.ask()
+            try:
+                study.tell(trial, _measure_trial(plan, store, trial))
+            except TrialPruned:
+                study.tell(trial, state=TrialState.PRUNED)
+            except InputError as error:
+                trial.set_user_attr("error", str(error))
+                study.tell(trial, state=TrialState.FAIL)
 
 
-def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
-    import optuna
+def _measure_trial(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
+    """The metric of a trial, whose run is deleted unless it is the best."""
+    from optuna import TrialPruned
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
         if plan.prune and "validation_loss" in logged:
             trial.report(logged["validation_loss"], step)
             if _is_hopeless(trial.study, trial.number, policy):
-                raise optuna.TrialPruned
+                raise TrialPruned
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
-    run = plan.out / TRIAL
+    config = plan.search.config(policy, values)
+    run = _name_run(plan, config)
+    shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
     try:
-        config = plan.search.config(policy, values)
-        run = _name_run(plan, config)
-        shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
         with label_progress(f"trial {trial.number}"):
             train_run(store, run, config, shared=shared, callbacks=callbacks)
             value = measure_run(TrainedPolicy.load(run), store, plan.metric, plan.k)
-    except (InputError, optuna.TrialPruned) as error:
-        if isinstance(error, InputError):
-            trial.set_user_attr("error", str(error))
+    except (InputError, TrialPruned):
         shutil.rmtree(run, ignore_errors=True)
         raise
     if value <= max(_list_values(trial.study), default=-math.inf):
@@ -304,7 +337,8 @@ def _write_report(study: "Study", plan: Plan) -> None:
         value = chosen[table][field] if name in names else plan.search.fixed[name]
         tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
     file = plan.out / BEST_TOML
-    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
+    options = ("--policy", config.policy_name, "--config", str(file))
+    command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
     count = len(list_finished(study))
     head = f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"
     with atomic_file(file) as scratch:

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
@@ -15,7 +16,7 @@ from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.checkpoint import read_metrics
-from ucfrec.reporting.model_card import tabulate_user_model
+from ucfrec.reporting.model_card import describe_data, tabulate_user_model
 from ucfrec.reporting.results import (
     conclude,
     draw_environments,
@@ -173,11 +174,12 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
             if (drawn := draw_frontier(run.record, read_candidates(run.folder))) is not None:
                 frontiers.append((run.name, drawn))
             samples.append((run.name, tabulate_samples(run.folder, features)))
+    data = Table.of_columns("Training data", {"value": describe_data(record)})
     pictures, quantiles = draw_distributions(record.data)
     return {
         "names": names,
         "store": record.store,
-        "data": [_tabulate_data(record), *tabulate_rows(record.data)],
+        "data": [data, *tabulate_rows(record.data)],
         "pictures": pictures,
         "quantiles": quantiles,
         "summary": _summarise(runs),
@@ -194,22 +196,6 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
-
-
-def _tabulate_data(record: RunRecord) -> Table:
-    sizes = record.sizes
-    rows: dict[str, object] = {
-        "fingerprint": record.fingerprint[:12],
-        "reward": record.reward,
-        "training sessions": record.train_episodes,
-        "training steps": record.train_steps,
-        "actions": f"{sizes['items']:,} items" if sizes["items"] else f"{sizes['action']} numbers",
-        "state dimensions": sizes["state"],
-        "mean return of a session": record.mean_return,
-    }
-    for level, value in record.return_quantiles.items():
-        rows[f"{float(level):.0%} of returns are at most"] = value
-    return Table.of_columns("Training data", {"value": rows})
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
@@ -231,13 +217,7 @@ def _summarise(runs: Sequence[_Run]) -> Table:
 
 def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    settings: dict[str, list[object]] = {}
-    for number, run in enumerate(runs):
-        for table, fields in {**run.record.settings, "version": run.record.versions}.items():
-            flat = {table: fields}
-            if isinstance(fields, dict) and fields:
-                flat = {f"{table}.{field}": value for field, value in fields.items()}
-            for name, value in flat.items():
-                settings.setdefault(name, [None] * len(runs))[number] = value
-    rows = [(n, values) for n, values in settings.items() if any(v != values[0] for v in values)]
+    settings = [{**run.record.settings, "version": run.record.versions} for run in runs]
+    columns = pd.json_normalize(settings, max_level=1).to_dict("list").items()
+    rows = [(str(n), values) for n, values in columns if any(v != values[0] for v in values)]
     return Table("Settings that differ", [run.name for run in runs], rows) if rows else None

@@ -17,14 +17,11 @@ from pydantic import AfterValidator, AllowInfNan, ConfigDict, Strict, TypeAdapte
 
 from ucfrec.errors import InputError
 from ucfrec.files import atomic
-from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-CONFIGURATIONS: Final = "configurations.jsonl"
-"""File next to the rows with each of their configurations, by hash."""
 Text = Annotated[str, Strict()]
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Whole = Annotated[int, Strict()]
@@ -76,7 +73,7 @@ class RowKey:
     conditions: Mapping[Text, Scalar] = field(default_factory=dict)
     """Other settings of the measurement: budget, episodes, distractor, …"""
     config_hash: Text | None = None
-    """Hash of the training configuration, which `configurations.jsonl` holds."""
+    """Hash of the training configuration, which the run's record holds."""
     data_fingerprint: Text | None = None
     """Fingerprint of the store."""
 
@@ -220,24 +217,15 @@ def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
     atomic.write_json(path, [row.to_json() for row in rows])
 
 
-def append_rows(
-    path: Path, rows: Sequence[ResultRow], config: Mapping[str, Any] | None = None
-) -> None:
-    """Append rows to a file, and their configuration to `configurations.jsonl` next to it.
-
-    Atomic: after an interruption either all rows are in the file or none. Other processes that
-    append to a file of the folder wait.
+def append_rows(path: Path, rows: Sequence[ResultRow]) -> None:
+    """Append rows to a file; after an interruption either all are in it or none. Other processes
+    that append to the file wait.
 
     Raises:
         ValueError: a row has a number that is not finite.
     """
-    if config is not None:
-        configurations, digest = path.with_name(CONFIGURATIONS), config_hash(config)
-        with atomic.claim(configurations, wait=True):
-            if digest not in (text := _read_text(configurations)):
-                _write(configurations, text, [{"hash": digest, "config": config}])
     with atomic.claim(path, wait=True):
-        _write(path, _read_text(path), [row.to_json() for row in rows])
+        _write(path, _read_text(path), rows)
 
 
 def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
@@ -246,7 +234,7 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
         rows = read_rows(path)
         remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
         if len(remaining) < len(rows):
-            _write(path, "", [row.to_json() for row in remaining])
+            _write(path, "", remaining)
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -277,10 +265,10 @@ def _read_text(path: Path) -> str:
     return text + "\n" if text and not text.endswith("\n") else text
 
 
-def _write(path: Path, text: str, values: Sequence[Mapping[str, Any]]) -> None:
-    """Replace a file by text and a line of JSON for each value."""
+def _write(path: Path, text: str, rows: Sequence[ResultRow]) -> None:
+    """Replace a file by text and the lines of rows."""
     write = partial(json.dumps, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    lines = "".join(f"{write(value)}\n" for value in values)
+    lines = "".join(f"{write(row.to_json())}\n" for row in rows)
     with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
         file.write((text + lines).encode())
         file.flush()

@@ -26,7 +26,7 @@ from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.processes import block_ctrl_c, label_progress, pool_of_processes
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.tables import markdown_table
+from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import SharedStages, train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -211,18 +211,13 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
 
 def _enqueue_again(study: "Study") -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
-    import optuna
+    from optuna.trial import TrialState
 
-    again = set(study.user_attrs.get("again", []))
     for trial in study.trials:
-        if trial.state.name == "RUNNING":
-            study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-        elif trial.state.name != "FAIL":
-            continue
-        if trial.number not in again and trial.params and "error" not in trial.user_attrs:
-            study.enqueue_trial(trial.params)
-            again.add(trial.number)
-    study.set_user_attr("again", sorted(again))
+        if trial.state == TrialState.RUNNING:
+            study.tell(trial.number, state=TrialState.FAIL)
+            if trial.params:
+                study.enqueue_trial(trial.params)
 
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
@@ -327,7 +322,7 @@ def importances(study: "Study") -> dict[str, float]:
 
 def _write_report(study: "Study", plan: Plan) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
-    config = config_of(plan, study.best_trial)
+    config, file = config_of(plan, study.best_trial), plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
     if "train.steps" in names:
         names.add("train.warmup_steps")
@@ -336,46 +331,44 @@ def _write_report(study: "Study", plan: Plan) -> None:
         table, _, field = name.partition(".")
         value = chosen[table][field] if name in names else plan.search.fixed[name]
         tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
-    file = plan.out / BEST_TOML
-    options = ("--policy", config.policy_name, "--config", str(file))
+    options = ("--policy", config.policy_name, "--config", str(file), "--out", "RUN")
     command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
-    count = len(list_finished(study))
-    head = f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"
-    with atomic_file(file) as scratch:
-        scratch.write_text(head + "".join(tables.values()), encoding="utf-8")
-    with atomic_file(plan.out / PAGE) as scratch:
-        scratch.write_text(_page(study, plan, command), encoding="utf-8")
-
-
-def _page(study: "Study", plan: Plan, command: str) -> str:
-    trials = sorted(
-        (t for t in study.trials if t.state.is_finished()),
-        key=lambda t: (t.value is None or t.state.name != "COMPLETE", -(t.value or 0.0)),
+    head = (
+        f"{plan.metric} {study.best_value:.6g} in trial {study.best_trial.number} of "
+        f"{len(list_finished(study))}"
     )
-    names = list(dict.fromkeys(name for trial in trials for name in trial.params))
-    body = []
-    for trial in trials:
-        outcomes = {"COMPLETE": f"{trial.value or 0:.6g}", "PRUNED": "ended early"}
-        error = str(trial.user_attrs.get("error", "interrupted"))[:80]
-        values = (trial.params.get(name, "") for name in names)
-        cells = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
-        body.append((trial.number, outcomes.get(trial.state.name, error), *cells))
-    shares = importances(study)
+    with atomic_file(file) as scratch:
+        text = f"# {head}\n# {command}\n{''.join(tables.values())}"
+        scratch.write_text(text, encoding="utf-8")
+    shares = [(name, f"{share:.2f}") for name, share in importances(study).items()]
     parts = [
         f"# Search on {plan.store}",
-        f"Metric: {plan.metric}, the {METRICS[plan.metric]}. The best trial, "
-        f"{study.best_trial.number}, has {study.best_value:.6g}; its run is `{BEST}`. It was "
+        f"{head}; its run is `{BEST}`. The metric is the {METRICS[plan.metric]}. The trial was "
         "selected on validation rows: estimate it on the test split or on later logs.",
         f"To train it again: `{command}`",
         "## Importance",
-        "Share of the variance of the metric between trials that a setting explains (fANOVA).",
-        markdown_table(("setting", "importance"), [(n, f"{v:.2f}") for n, v in shares.items()])
-        if shares
-        else "Too few trials to compare.",
+        "Share of the variance of the metric between trials that a setting explains (fANOVA); none "
+        "with too few trials.",
+        markdown_table(("setting", "importance"), shares),
         "## Trials",
-        markdown_table(("trial", plan.metric, *names), body),
+        _tabulate_trials(study, plan.metric),
     ]
-    return "\n\n".join(parts) + "\n"
+    with atomic_file(plan.out / PAGE) as scratch:
+        scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _tabulate_trials(study: "Study", metric: str) -> str:
+    """The trials, best first; those without a value last."""
+    trials = [trial for trial in study.trials if trial.state.is_finished()]
+    trials.sort(key=lambda t: (t.state.name != "COMPLETE", -(t.value or 0.0)))
+    names = dict.fromkeys(name for trial in trials for name in trial.params)
+    body = []
+    for trial in trials:
+        error = trial.user_attrs.get("error", "ended early or interrupted")
+        outcome = f"{trial.value:.6g}" if trial.state.name == "COMPLETE" else error
+        settings = (format_value(trial.params.get(name)) for name in names)
+        body.append((trial.number, outcome, *settings))
+    return markdown_table(("trial", metric, *names), body)
 
 
 def format_toml(value: Any) -> str:

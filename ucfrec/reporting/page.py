@@ -16,6 +16,7 @@ from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.checkpoint import read_metrics
+from ucfrec.logs.summary import format_report
 from ucfrec.reporting.model_card import describe_data, tabulate_user_model
 from ucfrec.reporting.results import (
     conclude,
@@ -36,7 +37,6 @@ from ucfrec.reporting.training import (
     read_features,
     select_curves,
     tabulate_augmentation,
-    tabulate_rows,
     tabulate_samples,
 )
 from ucfrec.results.statistics import grouped
@@ -174,12 +174,12 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
             if (drawn := draw_frontier(run.record, read_candidates(run.folder))) is not None:
                 frontiers.append((run.name, drawn))
             samples.append((run.name, tabulate_samples(run.folder, features)))
-    data = Table.of_columns("Training data", {"value": describe_data(record)})
     pictures, quantiles = draw_distributions(record.data)
     return {
         "names": names,
         "store": record.store,
-        "data": [data, *tabulate_rows(record.data)],
+        "data": Table.of_columns("Training data", {"value": describe_data(record)}),
+        "rows": format_report(record.data.model_dump()) if record.data.rows_read else "",
         "pictures": pictures,
         "quantiles": quantiles,
         "summary": _summarise(runs),

@@ -16,7 +16,6 @@ from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json, require_file
-from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
 from ucfrec.runs.run import SAMPLES
@@ -51,39 +50,6 @@ _DISTRIBUTIONS: Final = {
 _MOST_CHARACTERS: Final = 120
 """Most characters of the shown features of an item."""
 _LEVELS: Final = ("0", "0.25", "0.5", "0.75", "0.99", "1")
-_COUNTS: Final = {
-    "rows_read": "rows read",
-    "unsorted_rows": "rows out of order (sorted)",
-    "equal_times": "rows at equal times (in no order that could be learned)",
-    "steps": "steps kept",
-    "users": "users",
-    "items": "items",
-    "sessions": "sessions",
-    "sessions_cut": "sessions cut at a split",
-    "unknown_propensities": "steps with an unknown propensity",
-}
-_REASONS: Final = {
-    **REASONS,
-    "long_session": "its session, or the part of it in one split, is too long",
-    "short_episode": "its session, or the part of it in one split, is too short",
-}
-
-
-def tabulate_rows(source: Source) -> list[Table]:
-    """Tables of the rows that `prepare` read and dropped; none of a store that it did not make."""
-    total = source.rows_read
-    if total is None:
-        return []
-    values = {name: getattr(source, key) for key, name in _COUNTS.items()}
-    counts = {name: value for name, value in values.items() if value is not None}
-    dropped = []
-    for reason, rows in source.dropped.items():
-        name = f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}"
-        dropped.append((name, [rows, f"{rows / total:.2%}" if total else None]))
-    return [
-        Table.of_columns("Rows of the logs", {"count": counts}),
-        Table("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
-    ]
 
 
 def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table | None]:

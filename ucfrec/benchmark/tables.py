@@ -1,14 +1,9 @@
-"""Tables and plots of result rows: means and spreads over logs and seeds, and differences to a
+"""Tables of result rows: means and spreads over logs and seeds, and differences to a
 method."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
-from ucfrec.reporting.charts import LIGHT, PLAIN, file_style, save
-from ucfrec.reporting.charts import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
@@ -232,57 +227,3 @@ def _format(sample: Summary, number: str) -> str:
         return NONE
     error = f" ± {sample.standard_error:.2g}" if sample.count > 1 else ""
     return f"{sample.mean:{number}}{error}"
-
-
-def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:
-    """One plot per environment, called `kind`-environment: return of every method, mean and
-    standard deviation over seeds."""
-    return _plot(rows, folder, kind, ((None, "", None),))
-
-
-def plot_distractor(rows: Sequence[ResultRow], folder: Path) -> list[Path]:
-    """One plot per environment with a distractor: returns without it, with it off, and with it on,
-    of rows whose target return is the largest training return."""
-    rows = [row for row in rows if row.conditions["quantiles"] == "1"]
-    planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
-    rows = [row for row in rows if row.environment in planted]
-    colors = (PLAIN, OURS_COLOR, LIGHT)
-    bars = list(zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, colors, strict=True))
-    return _plot(rows, folder, "distractor", bars)
-
-
-@file_style()
-def _plot(
-    rows: Sequence[ResultRow],
-    folder: Path,
-    kind: str,
-    bars: Sequence[tuple[float | None, str, str | None]],
-) -> list[Path]:
-    """A plot per environment, with bars (rate of the distractor, label, color) of each method; None
-    for the color of the method."""
-    from matplotlib.figure import Figure
-
-    files, height = [], 0.75 / len(bars)
-    for environment, group in grouped(_select_checkpoint(rows), lambda r: r.environment).items():
-        figure, name = Figure(figsize=(5.2, 4.2)), f"{kind}-{environment}"
-        label = "return per session (mean ± sd over training seeds)"
-        axes = figure.add_subplot(title=name, xlabel=label)
-        by_method = dict(reversed(grouped(group, lambda row: row.method).items()))
-        for index, (rate, label, color) in enumerate(bars):
-            returns = [
-                summary(row.value for row in own if row.conditions.get("distractor") == rate)
-                for own in by_method.values()
-            ]
-            axes.barh(
-                np.arange(len(returns)) + height * ((len(bars) - 1) / 2 - index),
-                [own.mean for own in returns],
-                height,
-                xerr=[own.sd for own in returns],
-                color=[color or (OURS_COLOR if m == OURS else PLAIN) for m in by_method],
-                label=label,
-            )
-        axes.set_yticks(range(len(by_method)), list(by_method))
-        if len(bars) > 1:
-            axes.legend()
-        files += save(figure, folder, name)
-    return files

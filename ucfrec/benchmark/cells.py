@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -245,7 +246,7 @@ class Plan:
     ) -> Iterator[Cell]:
         """One cell for each training seed of each method that supports the actions of the task.
         Cells of equal trainings share a run."""
-        store = EpisodeStore.open(task.store)
+        store, make = EpisodeStore.open(task.store), self._fill(table, task)
         for name, method in methods.items():
             if not method.supports(store):
                 continue
@@ -260,13 +261,8 @@ class Plan:
             place = folder_name("-".join([task.name, *map(str, task.conditions.values())]))
             run = self.folder / "runs" / place / f"{folder_name(name)}-{digest}"
             for seed in range(self.budget.seeds_of(task.name, name)):
-                yield Cell(
-                    suite=self.suite,
-                    table=table,
-                    budget=self.budget.name,
-                    task=task.name,
+                yield make(
                     method=name,
-                    environments=task.environments,
                     evaluation=evaluation or self.budget.evaluation,
                     log_seed=task.log_seed,
                     training_seed=seed,
@@ -284,16 +280,15 @@ class Plan:
         """One cell for each built-in policy of the task's environments, told apart from one of
         `methods` with its name."""
         for name in task.behaviors:
-            yield Cell(
-                suite=self.suite,
-                table=table,
-                budget=self.budget.name,
-                task=task.name,
-                method=f"{name} (simulator)" if name in methods else name,
-                policy=name,
-                environments=task.environments,
-                evaluation=self.budget.evaluation,
+            method = f"{name} (simulator)" if name in methods else name
+            yield self._fill(table, task)(
+                method=method, policy=name, evaluation=self.budget.evaluation
             )
+
+    def _fill(self, table: str, task: Task) -> partial[Cell]:
+        """What all cells of a task in a table have."""
+        names: dict[str, Any] = {"suite": self.suite, "table": table, "budget": self.budget.name}
+        return partial(Cell, **names, task=task.name, environments=task.environments)
 
 
 def folder_name(name: str) -> str:

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
 from ucfrec.counterfactual.augmentation import AugmentationReport
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.logs.summary import format_report
@@ -80,8 +80,6 @@ def write_report(
     Raises:
         InputError: `out` is a folder, or as `render_report`.
     """
-    if out.is_dir():
-        raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
     page = render_report(runs, results, items)
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.

@@ -57,7 +57,7 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
     pictures, quantiles = [], []
     for name, (title, x_label) in _DISTRIBUTIONS.items():
         values = source.summary.get(name)
-        if values is None or source.rows_read is None:
+        if values is None:
             continue
         quantiles.append((title, [values.quantiles.get(level) for level in _LEVELS]))
         if total := sum(values.counts):
@@ -173,7 +173,6 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
-    require_file(run / ITEMS, "restore it")
     with damage_explained(run / SAMPLES, "restore it or train again"):
         sessions = samples["sessions"]
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}

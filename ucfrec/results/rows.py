@@ -3,7 +3,6 @@ of JSON in files that several processes may append to, and a table in Python."""
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
@@ -232,9 +231,7 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
     """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
     with atomic.claim(path, wait=True):
         rows = read_rows(path)
-        remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
-        if len(remaining) < len(rows):
-            _write(path, "", remaining)
+        _write(path, "", [row for row in rows if not any(key.covers(row) for key in keys)])
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -269,10 +266,8 @@ def _write(path: Path, text: str, rows: Sequence[ResultRow]) -> None:
     """Replace a file by text and the lines of rows."""
     write = partial(json.dumps, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     lines = "".join(f"{write(row.to_json())}\n" for row in rows)
-    with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
-        file.write((text + lines).encode())
-        file.flush()
-        os.fsync(file.fileno())
+    with atomic.atomic_file(path) as scratch:
+        scratch.write_bytes((text + lines).encode())
 
 
 _ORIGIN: Final = ("config_hash", "data_fingerprint")

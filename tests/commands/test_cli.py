@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.commands.train import settings_text
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
@@ -278,7 +280,7 @@ def test_a_command_does_what_the_python_api_does(
     shown["propensity"] = np.linspace(0.1, 0.9, len(shown))
     shown["arm"] = np.where(shown.index % 2, "a", "b")
     written, printed = [], []
-    for place in ("command", "api"):
+    for place in ("the command", "api"):
         shutil.copytree(catalog[0], tmp_path / place / "run")
         shutil.copytree(folder / STORE, tmp_path / place / STORE)
         monkeypatch.chdir(tmp_path / place)
@@ -286,13 +288,16 @@ def test_a_command_does_what_the_python_api_does(
         shown.to_parquet(SHOWN)
         log.assign(timestamp=log.timestamp + 10**9).head(600).to_parquet("newer.parquet")
         capsys.readouterr()
-        if place == "command":
+        if place == "the command":
             assert main(arguments.split()) == 0
         else:
             function(Recommender.load("run"))
         printed.append(capsys.readouterr().out)
         files = [path for path in Path().rglob("*") if path.is_file() and STORE not in str(path)]
         written.append({str(path): _content(path) for path in files if "tfevents" not in path.name})
+    for hint in re.findall(r"(?:next: | {6})(ucfrec .*?)(?:, |$)", printed[0], re.MULTILINE):
+        words = shlex.split(hint)[1:]
+        build_parser(UCFREC, words).parse_args(words)
     assert written[0].keys() == written[1].keys()
     for name, content in written[0].items():
         if isinstance(content, pd.DataFrame):
@@ -539,6 +544,13 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     printed = refused(arguments.split(), capsys)
     assert re.search(says, printed), printed
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "run.json"}
+
+
+def test_errors_are_shown_whole(tmp_path: Path) -> None:
+    long = "x" * 999
+    assert f"({long})" in str(explanation(MemoryError(long)))
+    with pytest.raises(InputError, match=long), damage_explained(tmp_path, "restore it"):
+        raise KeyError(long)
 
 
 def test_a_package_that_is_missing_is_named_with_its_extra() -> None:

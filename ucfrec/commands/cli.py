@@ -143,13 +143,13 @@ def explanation(error: BaseException) -> str | None:
         return f"{error.name} is not installed; install ucfrec[{extra}]"
     text = str(error)
     if isinstance(error, MemoryError) or re.search(_NO_MEMORY, text):
-        reason = f" ({text:.120})" if text else ""
+        reason = f" ({text})" if text else ""
         return (
             f"memory is exhausted{reason}; close other programs, raise the limit (ulimit -v), or "
             "use smaller settings"
         )
     if re.search(_NO_SPACE, text):
-        return f"no space is left on a disk ({text:.120}); free space and run again"
+        return f"no space is left on a disk ({text}); free space and run again"
     return None
 
 

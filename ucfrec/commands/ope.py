@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
@@ -71,7 +72,6 @@ class Ope(RuleOptions, LogOptions):
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
         from ucfrec.results.rows import write_results
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
         settings = settings_given(self, evaluate.EstimateOptions)
@@ -85,7 +85,7 @@ class Ope(RuleOptions, LogOptions):
                 "--scored takes probabilities as they are; give --filter-seen to score"
             )
         # On the test split, the weights that have not learned from it.
-        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
         parts = ("run", "target return", "temperature")
         names = names_of(
@@ -242,9 +242,8 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
         from ucfrec.files.parquet import write_frames
         from ucfrec.logs.summary import format_report
         from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         rule = self.make_rule(trained)
         if (master := self.find_spark()) is not None:
             from ucfrec.off_policy.scored import score_with_spark
@@ -295,10 +294,9 @@ class Rank(LogOptions, RuleOptions):
         from ucfrec.logs.summary import format_summary
         from ucfrec.provenance import shorten_paths
         from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
-        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        policies = [self.load(run, split=not logs) for run in runs]
         require_one_catalogue(policies)
         with self.read_sessions(policies, logs, self.json) as logged:
             if logs:
@@ -354,5 +352,5 @@ def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
     return (
         f"\n{rows[best].method} has the highest hit rate on liked items ({rates[best]:.3f} with "
         f"{rows[best].conditions['k']} items){first}. Logged clicks favour what was shown:\n"
-        f"next: ucfrec ope {run}, the return per session that it would bring"
+        f"next: ucfrec ope {quote(str(run))}, the return per session that it would bring"
     )

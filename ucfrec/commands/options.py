@@ -170,9 +170,7 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
 def _read_number(limits: range, word: str) -> int:
     if not word.isdecimal() or len(word) > 19 or int(word) not in limits:
         most = f"to {limits.stop - 1}" if limits.stop < POSITIVE.stop else "on"
-        raise argparse.ArgumentTypeError(
-            f"{word:.40} is not a whole number from {limits.start} {most}"
-        )
+        raise argparse.ArgumentTypeError(f"{word} is not a whole number from {limits.start} {most}")
     return int(word)
 
 

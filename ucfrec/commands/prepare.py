@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table, settings_given
@@ -67,7 +68,7 @@ class Prepare(LogOptions, SparkOption):
         store = origin(self.out)
         print(
             f"\nstore: {store}; policies learn from its train split, later rows validate and test "
-            f"them\nnext: ucfrec train {store} --out RUN"
+            f"them\nnext: ucfrec train {quote(store)} --out RUN"
         )
 
 
@@ -110,8 +111,8 @@ class Datasets(Table):
         logs = load_release(adapter, datasets[adapter], self.name, self.folder, self.part)
         release = datasets[adapter].releases[self.name]
         part = release.parts[self.part or next(iter(release.parts))]
+        place = quote(str(self.folder / self.name / part))
         print(
             f"{self.name}: {len(logs.files)} log files; {release.licence}, {release.homepage}\n"
-            f"next: ucfrec prepare '{self.folder / self.name / part}' --dataset {adapter} "
-            "--out store"
+            f"next: ucfrec prepare {place} --dataset {adapter} --out store"
         )

@@ -38,7 +38,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     """Instead of LOGS and --out: read requests from stdin, JSON on each line, and write answers to
     stdout; see docs/serving.md"""
     candidates: Annotated[Path | None, "FILE"] = None
-    """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
+    """The only items to recommend; Parquet or CSV with a column item_id, or with the name
+    that the log of the run has for it (default: all)"""
     new_session: Annotated[bool, Group("answering")] = False
     """Recommend for the first step of a new session (default: the user's latest one goes on)"""
     approximate: Annotated[bool, Group("answering")] = False
@@ -60,9 +61,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         from ucfrec.files.parquet import write_frames
         from ucfrec.recommending.histories import histories_of_files
         from ucfrec.recommending.recommend import recommend
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained, index = TrainedPolicy.load(self.run, self.checkpoint), None
+        trained, index = self.load(self.run), None
         master = self.find_spark()
         files, mapping = self.find_logs(self.logs, trained, [self.out, self.exposures])
         how: Any = {
@@ -128,7 +128,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             return None
         from ucfrec.reporting.training import read_features
 
-        table = read_features(self.candidates, text_ids=True)
+        table = read_features(self.candidates, [trained.record.data], text_ids=True)
         column = table.column(schema.ITEM_ID).drop_null()
         ids: Array = column.unique().to_numpy(zero_copy_only=False)
         in_run = trained.items.numbers(ids) >= 0
@@ -144,7 +144,6 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
 
     def _answer_stream(self) -> None:
         from ucfrec.recommending.stream import answer_stream
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         refusals = {
             "--stream reads stdin and writes stdout; leave LOGS and --out out": self.logs
@@ -158,7 +157,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         for message, refused in refusals.items():
             if refused:
                 raise InputError(message)
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         # Unbuffered, so that a request is answered without waiting for the next ones.
         with (
             closing(self.make_responder(trained)) as responder,
@@ -184,9 +183,8 @@ class Export(RuleOptions, RunArgument):
     def execute(self) -> None:
         """Write the policy with its rule as an ONNX graph, and compare it with torch."""
         from ucfrec.recommending.export import export
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         written = export(trained, self.onnx, rule=self.make_rule(trained), k=self.k)
         print(
             f"{self.onnx}: {written.size / 1e6:,.1f} MB, scores equal torch's to "

@@ -145,7 +145,7 @@ class RuleOptions(Table):
     shows_defaults = False
 
     checkpoint: Literal["best", "last"] = "best"
-    """Policy weights: of the lowest validation loss, or the last ones."""
+    """Policy weights; of the lowest validation loss, or the last ones, of runs without a refit"""
     target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
     """Target return, in units of the reward, of a session; of every step with a horizon or
     discount"""
@@ -164,6 +164,18 @@ class RuleOptions(Table):
     exclude_seen: bool = False
     tag_window: Annotated[int | None, "N"] = None
     tag_run: Annotated[int | None, "N"] = None
+
+    def load(self, run: Path, split: bool = False) -> "TrainedPolicy":
+        """The policy of a run, with the weights that the command line names."""
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        trained = TrainedPolicy.load(run, self.checkpoint, split=split)
+        if self.checkpoint == "last" and trained.record.refit_of is not None:
+            raise InputError(
+                f"--checkpoint last: {run} acts by weights that went on learning from all rows to "
+                "the end, of which there is one checkpoint; leave it out, or train with --no-refit"
+            )
+        return trained
 
     def make_rule(self, trained: "TrainedPolicy") -> "DecisionRule":
         """The run's decision rule with the parts that the command line names."""

@@ -1,5 +1,6 @@
 """`ucfrec evaluate` and `collect`: policies in a simulated environment, and logs of it."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -37,12 +38,11 @@ class Evaluate(SimulationOptions, RuleOptions):
         """Print one row per policy."""
         from ucfrec.reporting.measuring import evaluate_in
         from ucfrec.reporting.tables import evaluation_table
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         environment = self.make_environment(self.env)
         if not self.runs and not self.behavior:
             raise InputError("name a run folder, or a built-in policy with --behavior")
-        policies = {run: TrainedPolicy.load(run, self.checkpoint) for run in self.runs}
+        policies = {run: self.load(run) for run in self.runs}
         evaluation = evaluate_in(
             environment,
             {run: (policy, self.make_rule(policy)) for run, policy in policies.items()},
@@ -59,8 +59,9 @@ class Evaluate(SimulationOptions, RuleOptions):
         )
         if self.json is not None:
             evaluation.save(self.json)
-            runs = " ".join(map(str, self.runs)) or "RUN"
-            print(f"next: ucfrec report {runs} --results {self.json} --out report.html")
+            runs = shlex.join(map(str, self.runs)) or "RUN"
+            file = shlex.quote(str(self.json))
+            print(f"next: ucfrec report {runs} --results {file} --out report.html")
 
 
 class Collect(SimulationOptions):

@@ -7,6 +7,7 @@ import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table
@@ -101,13 +102,14 @@ class Train(TrainingOptions):
         if (self.out / REFIT / RUN).exists():
             whole = read_record(self.out / REFIT)
             print(f"refit         {whole.train_steps:,} rows, all of the store")
+        run = quote(str(self.out))
         print(f"\nrun: {self.out} (TensorBoard can open it)\nmodel card: {self.out / CARD}")
         if record.rule is None:
-            print(f"next: ucfrec evaluate {self.out} --env NAME, in a simulator of these actions")
+            print(f"next: ucfrec evaluate {run} --env NAME, in a simulator of these actions")
         else:
             print(
-                f"next: ucfrec ope {self.out}, its value on the test split of the store\n"
-                f"      ucfrec recommend {self.out} LOGS --out FILE, the next items of every user"
+                f"next: ucfrec ope {run}, its value on the test split of the store\n"
+                f"      ucfrec recommend {run} LOGS --out FILE, the next items of every user"
             )
 
 
@@ -181,8 +183,8 @@ class Tune(Table):
             f"\n{self.metric} {study.best_value:.6g} in trial {best.number}, of "
             f"{len(list_finished(study))} trials; selected on validation rows\n"
             f"settings: {self.out / BEST_TOML}\nall trials: {self.out / PAGE}\n"
-            f"next: ucfrec ope {self.out / BEST}, its value on the test split, which no trial has "
-            "seen"
+            f"next: ucfrec ope {quote(str(self.out / BEST))}, its value on the test split, which "
+            "no trial has seen"
         )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE, Table
@@ -113,7 +114,7 @@ class Update(LogOptions, RunArgument):
         if update.verdict.result == "worse":
             print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
         else:
-            print(f"next: ucfrec promote {self.out}, if `serve` follows its folder")
+            print(f"next: ucfrec promote {quote(str(self.out))}, if `serve` follows its folder")
 
 
 class Compare(Table):

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -304,7 +305,10 @@ def _write_report(study: "Study", plan: Plan) -> None:
         value = chosen[table][field] if name in names else plan.search.fixed[name]
         tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
     file = plan.out / BEST_TOML
-    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
+    command = (
+        f"ucfrec train {quote(str(plan.store))} --policy {config.policy_name} "
+        f"--config {quote(str(file))} --out RUN"
+    )
     count = len(list_finished(study))
     head = f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"
     with atomic_file(file) as scratch:
@@ -322,7 +326,7 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
     body = []
     for trial in trials:
         outcomes = {"COMPLETE": f"{trial.value or 0:.6g}", "PRUNED": "ended early"}
-        error = str(trial.user_attrs.get("error", "interrupted"))[:80]
+        error = str(trial.user_attrs.get("error", "interrupted"))
         values = (trial.params.get(name, "") for name in names)
         cells = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
         body.append((trial.number, outcomes.get(trial.state.name, error), *cells))

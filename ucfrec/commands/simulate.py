@@ -81,26 +81,13 @@ class Collect(SimulationOptions):
         environment = self.make_environment(self.env)
         simulator = environment.simulator()
         behavior = self.behavior or simulator.logging_behavior
-        if behavior not in simulator.behaviors:
-            names = ", ".join(simulator.behaviors)
-            raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {names}")
-        env = simulator.started(256, environment.folder)
-        played = collect(
-            simulator,
-            env,
-            simulator.behaviors[behavior](env, self.seed),
-            self.sessions,
-            self.seed,
-            self.out,
-            env_name=environment.title,
-            behavior=behavior,
-        )
+        env, actor = environment.start(256, behavior, self.seed)
+        named = {"env_name": environment.title, "behavior": behavior}
+        played = collect(simulator, env, actor, self.sessions, self.seed, self.out, **named)
         size = (env.single_observation_space.shape or (0,))[0]
-        observation = (
-            f"observation of {size} numbers"
-            if size
-            else "no observation: states come from the items shown and their rewards"
-        )
+        observation = f"observation of {size} numbers"
+        if not size:
+            observation = "no observation: states come from the items shown and their rewards"
         print(
             f"{self.out}: {self.sessions} sessions of {behavior}, {int(played.lengths.sum())} "
             f"steps, mean return {played.returns.mean():.3f}; reward column {simulator.feedback}; "

@@ -2,13 +2,14 @@
 `screen` choose them and columns."""
 
 import inspect
+import json
 import shutil
 import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table
 from ucfrec.errors import InputError, InputNote
@@ -240,19 +241,11 @@ def settings_text(policy: str, width: int) -> str:
         summary = inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
         text += ["", *textwrap.wrap(f"[{name}]  {summary}", width)]
         for setting in describe(name, table):
-            value = _format_toml(setting.value)
+            value = setting.value if isinstance(setting.value, str) else json.dumps(setting.value)
+            value = "unset" if setting.value is None else value
             text.append(f"  {setting.key:<26}  {value:<22}  {setting.allowed}")
             indent = " " * 6
             text += textwrap.wrap(
                 setting.meaning, width, initial_indent=indent, subsequent_indent=indent
             )
     return "\n".join(text)
-
-
-def _format_toml(value: Any) -> str:
-    """A value as `--set` takes it; "unset" for None."""
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_format_toml, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "unset" if value is None else str(value)

@@ -3,7 +3,7 @@ policy; `rank`: how policies rank what users were shown and clicked later."""
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -23,6 +23,7 @@ from ucfrec.files.remote import origin
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Selection
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.rows import Ranking, ResultRow
@@ -87,18 +88,19 @@ class Ope(RuleOptions, LogOptions):
         # On the test split, the weights that have not learned from it.
         policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
-        parts = ("run", "target return", "temperature")
+        parts = [(policy.folder, rule) for policy, rules in candidates for rule in rules]
         names = names_of(
             [
-                dict(zip(parts, (str(p.folder), rule.target, rule.temperature), strict=True))
-                for p, rules in candidates
-                for rule in rules
+                {"run": str(run), "target return": rule.target, "temperature": rule.temperature}
+                for run, rule in parts
             ]
         )
         reports: dict[str, OffPolicyReport] = {}
         for policy, rules in candidates:
-            reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
-            with nullcontext() if self.scored else reading as logged:
+            reading: AbstractContextManager[LoggedSessions | None] = nullcontext()
+            if not self.scored:
+                reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+            with reading as logged:
                 if logged is not None and logs:
                     print(format_summary(logged.report))
                 elif logged is not None:
@@ -118,17 +120,14 @@ class Ope(RuleOptions, LogOptions):
                         checkpoint=self.checkpoint,
                     )
                     print(_describe(reports[name]))
-        columns: dict[str, dict[str, object]] = {name: {"candidate": name} for name in reports}
-        if len(reports) > 1:
-            choice = choose(reports, self.seed)
+        choice = choose(reports, self.seed) if len(reports) > 1 else None
+        if choice is not None:
             print(_describe_choice(choice))
-            columns = {name: {"candidate": name, **choice.columns(name)} for name in reports}
+        rows = []
+        for name, report in reports.items():
+            columns = {"candidate": name} | (choice.columns(name) if choice else {})
+            rows += [row.extended(columns) for row in (*report.rows, *report.step_rows)]
         if self.json is not None:
-            rows = [
-                row.extended(columns[name])
-                for name, report in reports.items()
-                for row in (*report.rows, *report.step_rows)
-            ]
             write_results(self.json, rows)
 
     def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":

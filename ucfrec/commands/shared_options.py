@@ -1,8 +1,8 @@
 """Options that several commands share, and the objects that they stand for."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -95,25 +95,21 @@ class LogOptions(Table):
         require_other_files((path for path in outputs if path is not None), inputs)
         return files, mapping
 
-    @contextmanager
     def read_sessions(
         self,
         policies: "Sequence[TrainedPolicy]",
         logs: Sequence[str],
         output: Path | None,
         keep_unknown: bool = False,
-    ) -> "Iterator[LoggedSessions]":
+    ) -> "AbstractContextManager[LoggedSessions]":
         """Sessions of logs, read as the first policy was trained; those of the test split of the
         policies' store if no logs are named."""
         from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
 
         if not logs:
-            yield held_out_sessions(policies)
-            return
+            return nullcontext(held_out_sessions(policies))
         files, mapping = self.find_logs(logs, policies[0], [output])
-        limit = self.memory_limit
-        with read_logged_sessions(policies[0], files, mapping, keep_unknown, limit) as logged:
-            yield logged
+        return read_logged_sessions(policies[0], files, mapping, keep_unknown, self.memory_limit)
 
 
 class SparkOption(Table):
@@ -229,16 +225,15 @@ class AnswerOptions(RuleOptions):
             engine=self.engine,
         )
 
-    @contextmanager
-    def open_exposures(self, trained: "TrainedPolicy") -> "Iterator[ExposureLog | None]":
+    def open_exposures(
+        self, trained: "TrainedPolicy"
+    ) -> "AbstractContextManager[ExposureLog | None]":
         """Where a server's answers are written; None for nowhere."""
         from ucfrec.recommending.exposures import ExposureLog
 
         if self.exposures is None:
-            yield None
-            return
-        with closing(ExposureLog(self.exposures, trained)) as log:
-            yield log
+            return nullcontext()
+        return closing(ExposureLog(self.exposures, trained))
 
 
 class EnvironmentOptions(Table):

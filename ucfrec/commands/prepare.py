@@ -1,13 +1,12 @@
 """`ucfrec prepare`: turn logs into an episode store; `datasets`: find public ones."""
 
-import warnings
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table, settings_given
 from ucfrec.commands.shared_options import LogOptions, SparkOption
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.remote import origin
 
 
@@ -95,7 +94,7 @@ class Datasets(Table):
             try:
                 datasets[name] = load_plugin("datasets", name)
             except InputError as error:
-                warnings.warn(str(error), InputNote, stacklevel=2)
+                warn_user(str(error))
         if self.name is None:
             lines = [
                 (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)

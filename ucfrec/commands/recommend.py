@@ -2,7 +2,6 @@
 chooses them."""
 
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +16,7 @@ from ucfrec.commands.shared_options import (
     RunArgument,
     SparkOption,
 )
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.processes import progress
 
@@ -134,11 +133,9 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         in_run = trained.items.numbers(ids) >= 0
         if in_run.all() or not in_run.any():
             return ids
-        warnings.warn(
+        warn_user(
             f"{self.candidates}: the run does not know {int((~in_run).sum()):,} of {len(ids):,} "
-            "items, which are not recommended; prepare and train on logs with them",
-            InputNote,
-            stacklevel=2,
+            "items, which are not recommended; prepare and train on logs with them"
         )
         return ids[in_run]
 

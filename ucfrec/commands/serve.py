@@ -57,12 +57,16 @@ class Serve(AnswerOptions):
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.server import MOST, Workers
+        from ucfrec.recommending.server import (
+            MOST,
+            PrintingServer,
+            Workers,
+            listening_socket,
+            ready_line,
+        )
 
         if not 1 <= self.workers <= MOST:
             raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
-        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
-
         address = listening_socket(self.host, self.port)
         if self.workers == 1:
             self._serve(address, PrintingServer)

@@ -42,10 +42,10 @@ class Evaluate(SimulationOptions, RuleOptions):
         environment = self.make_environment(self.env)
         if not self.runs and not self.behavior:
             raise InputError("name a run folder, or a built-in policy with --behavior")
-        policies = {run: self.load(run) for run in self.runs}
+        policies = [self.load(run) for run in dict.fromkeys(self.runs)]
         evaluation = evaluate_in(
             environment,
-            {run: (policy, self.make_rule(policy)) for run, policy in policies.items()},
+            [(policy, self.make_rule(policy)) for policy in policies],
             self.behavior,
             episodes=self.episodes,
             seed=self.seed,

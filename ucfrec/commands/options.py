@@ -9,10 +9,10 @@ import argparse
 import ast
 import inspect
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
+from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
@@ -194,12 +194,12 @@ def _read_number(limits: range, word: str) -> int:
 
 def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> str:
     """The help of an option, with its default if that is a value."""
-    text, _ = _read_docstrings(owner.__module__)[f"{owner.__name__}.{field.name}"]
+    text, _ = read_docstrings(owner.__module__)[f"{owner.__name__}.{field.name}"]
     default = field.default
     if not text:
         module, _, table = owner.described_by.partition(":")
         name = f"{table}.{field.name.removeprefix(owner.prefix)}"
-        text, borrowed = _read_docstrings(module)[name]
+        text, borrowed = read_docstrings(module)[name]
         text = text[:1].upper() + text[1:]
         if vars(owner).get("shows_defaults", True):
             text = re.sub(r"[;,] None for ([^.]*)", r" (default: \1)", text)
@@ -212,13 +212,12 @@ def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> 
 
 
 @cache
-def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
+def read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     """`CLASS.FIELD` and `CLASS.METHOD.ARGUMENT` of a module to what its source says of them, on one
     line, and to the default of a field."""
-    package, *names = module.split(".")
-    file = Path(sys.modules[package].__path__[0]).joinpath(*names).with_suffix(".py")
-    texts = {}
-    for cls in ast.parse(file.read_text(encoding="utf-8")).body:
+    spec, texts = find_spec(module), {}
+    source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
+    for cls in ast.parse(source).body:
         if not isinstance(cls, ast.ClassDef):
             continue
         for line, next_line in zip_longest(cls.body, cls.body[1:]):

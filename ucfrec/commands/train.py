@@ -7,11 +7,12 @@ import shutil
 import textwrap
 import warnings
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table
+from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table, read_docstrings
 from ucfrec.errors import InputError, InputNote
 from ucfrec.policies.registry import policy_names
 
@@ -228,7 +229,7 @@ class Settings(Table):
 def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, one section per table."""
     from ucfrec.runs.config import TABLES, resolve_config
-    from ucfrec.settings import describe
+    from ucfrec.settings import allowed_values
 
     config, width = resolve_config(policy), min(width, _WIDEST)
     text = textwrap.wrap(
@@ -237,15 +238,18 @@ def settings_text(policy: str, width: int) -> str:
         width,
     )
     for name in TABLES:
-        table = getattr(config, name)
+        table, indent = getattr(config, name), " " * 6
+        classes = type(table).__mro__[:-1]  # the last one is object
         summary = inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
         text += ["", *textwrap.wrap(f"[{name}]  {summary}", width)]
-        for setting in describe(name, table):
-            value = setting.value if isinstance(setting.value, str) else json.dumps(setting.value)
-            value = "unset" if setting.value is None else value
-            text.append(f"  {setting.key:<26}  {value:<22}  {setting.allowed}")
-            indent = " " * 6
-            text += textwrap.wrap(
-                setting.meaning, width, initial_indent=indent, subsequent_indent=indent
+        for field in (field.name for field in fields(table)):
+            texts = (
+                read_docstrings(cls.__module__).get(f"{cls.__name__}.{field}", ("", ""))[0]
+                for cls in classes
             )
+            meaning, value = next(filter(None, texts), ""), getattr(table, field)
+            words = value if isinstance(value, str) else json.dumps(value)
+            words = "unset" if value is None else words
+            text.append(f"  {f'{name}.{field}':<26}  {words:<22}  {allowed_values(table, field)}")
+            text += textwrap.wrap(meaning, width, initial_indent=indent, subsequent_indent=indent)
     return "\n".join(text)

@@ -1,12 +1,9 @@
 """The command line as a stranger meets it: small logs, real commands, clear refusals."""
 
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,7 +18,6 @@ from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.commands.train import settings_text
-from ucfrec.errors import InputError, damage_explained
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
@@ -85,20 +81,6 @@ def refused(arguments: list[str], capsys: Capsys) -> str:
     printed = capsys.readouterr().err.strip()
     assert "\n" not in printed
     return printed
-
-
-def test_help_answers_at_once() -> None:
-    def seconds() -> float:
-        """Of the processor, which other work on the machine does not lengthen."""
-        before = os.times()
-        subprocess.run(
-            [sys.executable, "-m", "ucfrec.commands.cli", "--help"], check=True, stdout=-3
-        )
-        after = os.times()
-        spent = (after.children_user, -before.children_user)
-        return sum((*spent, after.children_system, -before.children_system))
-
-    assert min(seconds() for _ in range(3)) < 0.5
 
 
 @pytest.mark.parametrize("command", UCFREC.commands)
@@ -528,7 +510,6 @@ def test_a_run_of_another_store_or_configuration_is_refused(folder: Path, capsys
             "--gap-minutes needs --session-by gap, not user",
         ),
         ("ope . scored.parquet --scored --filter-seen", "give --filter-seen to score"),
-        ("compare logs --arms A", "--arms A: write two names, A,B"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
@@ -546,11 +527,9 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "run.json"}
 
 
-def test_errors_are_shown_whole(tmp_path: Path) -> None:
+def test_errors_are_shown_whole() -> None:
     long = "x" * 999
     assert f"({long})" in str(explanation(MemoryError(long)))
-    with pytest.raises(InputError, match=long), damage_explained(tmp_path, "restore it"):
-        raise KeyError(long)
 
 
 def test_a_package_that_is_missing_is_named_with_its_extra() -> None:

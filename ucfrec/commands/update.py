@@ -141,12 +141,7 @@ class Compare(Table):
         from ucfrec.files.atomic import write_json
         from ucfrec.off_policy.ab_test import compare_arms
 
-        arms = None
-        if self.arms is not None:
-            first, _, second = (part.strip() for part in self.arms.partition(","))
-            if not (first and second):
-                raise InputError(f"--arms {self.arms}: write two names, A,B")
-            arms = first, second
+        arms = None if self.arms is None else [arm.strip() for arm in self.arms.split(",")]
         if self.expected is not None and not self.expected > 0:
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
         result = compare_arms(self.logs, self.column, arms, self.expected, self.memory_limit)

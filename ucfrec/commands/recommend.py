@@ -2,7 +2,6 @@
 chooses them."""
 
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +16,7 @@ from ucfrec.commands.shared_options import (
     RunArgument,
     SparkOption,
 )
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.processes import progress
 
@@ -38,7 +37,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     """Instead of LOGS and --out: read requests from stdin, JSON on each line, and write answers to
     stdout; see docs/serving.md"""
     candidates: Annotated[Path | None, "FILE"] = None
-    """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
+    """The only items to recommend; Parquet or CSV with a column item_id, or with the name
+    that the log of the run has for it (default: all)"""
     new_session: Annotated[bool, Group("answering")] = False
     """Recommend for the first step of a new session (default: the user's latest one goes on)"""
     approximate: Annotated[bool, Group("answering")] = False
@@ -60,9 +60,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         from ucfrec.files.parquet import write_frames
         from ucfrec.recommending.histories import histories_of_files
         from ucfrec.recommending.recommend import recommend
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained, index = TrainedPolicy.load(self.run, self.checkpoint), None
+        trained, index = self.load(self.run), None
         master = self.find_spark()
         files, mapping = self.find_logs(self.logs, trained, [self.out, self.exposures])
         how: Any = {
@@ -128,23 +127,20 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             return None
         from ucfrec.reporting.training import read_features
 
-        table = read_features(self.candidates, text_ids=True)
+        table = read_features(self.candidates, [trained.record.data], text_ids=True)
         column = table.column(schema.ITEM_ID).drop_null()
         ids: Array = column.unique().to_numpy(zero_copy_only=False)
         in_run = trained.items.numbers(ids) >= 0
         if in_run.all() or not in_run.any():
             return ids
-        warnings.warn(
+        warn_user(
             f"{self.candidates}: the run does not know {int((~in_run).sum()):,} of {len(ids):,} "
-            "items, which are not recommended; prepare and train on logs with them",
-            InputNote,
-            stacklevel=2,
+            "items, which are not recommended; prepare and train on logs with them"
         )
         return ids[in_run]
 
     def _answer_stream(self) -> None:
         from ucfrec.recommending.stream import answer_stream
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         refusals = {
             "--stream reads stdin and writes stdout; leave LOGS and --out out": self.logs
@@ -158,7 +154,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         for message, refused in refusals.items():
             if refused:
                 raise InputError(message)
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         # Unbuffered, so that a request is answered without waiting for the next ones.
         with (
             closing(self.make_responder(trained)) as responder,
@@ -184,9 +180,8 @@ class Export(RuleOptions, RunArgument):
     def execute(self) -> None:
         """Write the policy with its rule as an ONNX graph, and compare it with torch."""
         from ucfrec.recommending.export import export
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         written = export(trained, self.onnx, rule=self.make_rule(trained), k=self.k)
         print(
             f"{self.onnx}: {written.size / 1e6:,.1f} MB, scores equal torch's to "

@@ -57,12 +57,16 @@ class Serve(AnswerOptions):
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.server import MOST, Workers
+        from ucfrec.recommending.server import (
+            MOST,
+            PrintingServer,
+            Workers,
+            listening_socket,
+            ready_line,
+        )
 
         if not 1 <= self.workers <= MOST:
             raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
-        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
-
         address = listening_socket(self.host, self.port)
         if self.workers == 1:
             self._serve(address, PrintingServer)
@@ -92,7 +96,6 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.server import server_config
         from ucfrec.recommending.web import ServerLimits, application
         from ucfrec.runs.record import RUN, verify_run
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         several, threads = self.workers > 1, self.threads
         if threads is None and several:
@@ -104,7 +107,7 @@ class Serve(AnswerOptions):
 
         def make(run: Path) -> "Responder":
             verify_run(run)
-            return self.make_responder(TrainedPolicy.load(run, self.checkpoint))
+            return self.make_responder(self.load(run))
 
         shares = None if self.split is None else parse_split(self.split)
         folder = self.run.resolve()
@@ -172,8 +175,9 @@ class Explore(Table):
     runs: Annotated[Sequence[Path], ARGUMENT, "RUN"]
     """Run folder of `ucfrec train`; two are shown side by side."""
     items: Annotated[Path | None, "FILE"] = None
-    """Item features to show: Parquet or CSV with a column item_id; title (or name) and image_url
-    (or image) are shown as such (default: none)"""
+    """Item features to show: Parquet or CSV with a column item_id, or with the name that the log
+    of the run has for it; title (or name) and image_url (or image) are shown as such (default:
+    none)"""
     results: Annotated[Sequence[Path], "FILE…"] = ()
     """Results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict (default:
     none)"""
@@ -187,8 +191,9 @@ class Explore(Table):
         from ucfrec.reporting.training import read_features
         from ucfrec.runs.trained_policy import TrainedPolicy
 
-        features = None if self.items is None else read_features(self.items)
         runs = [TrainedPolicy.load(run) for run in self.runs]
+        logs = [run.record.data for run in runs]
+        features = None if self.items is None else read_features(self.items, logs)
         explorer = Explorer(runs, features, self.results)
         config = server_config(application(explorer, ("localhost", "127.0.0.1", "[::1]")))
         with listening_socket("127.0.0.1", self.port) as listening:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE, Table
@@ -113,7 +114,7 @@ class Update(LogOptions, RunArgument):
         if update.verdict.result == "worse":
             print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
         else:
-            print(f"next: ucfrec promote {self.out}, if `serve` follows its folder")
+            print(f"next: ucfrec promote {quote(str(self.out))}, if `serve` follows its folder")
 
 
 class Compare(Table):
@@ -140,12 +141,7 @@ class Compare(Table):
         from ucfrec.files.atomic import write_json
         from ucfrec.off_policy.ab_test import compare_arms
 
-        arms = None
-        if self.arms is not None:
-            first, _, second = (part.strip() for part in self.arms.partition(","))
-            if not (first and second):
-                raise InputError(f"--arms {self.arms}: write two names, A,B")
-            arms = first, second
+        arms = None if self.arms is None else [arm.strip() for arm in self.arms.split(",")]
         if self.expected is not None and not self.expected > 0:
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
         result = compare_arms(self.logs, self.column, arms, self.expected, self.memory_limit)

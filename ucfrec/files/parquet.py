@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ucfrec.arrays import Array
-from ucfrec.errors import InputError, one_line
+from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, require_file
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def read_ids(path: Path, column: str) -> Array:
     except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
         if _NO_THREAD in str(error):
             raise MemoryError(str(error)) from None
-        what = f"is damaged or has no column {column!r} ({one_line(str(error)):.200})"
+        what = f"is damaged or has no column {column!r} ({error})"
         raise InputError(f"{path} {what}; {_REMEDY}") from None
     integers = pa.types.is_integer(ids.type)
     texts = pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from textwrap import shorten
 from typing import Final, get_args
 
 from ucfrec import schema
@@ -396,5 +395,5 @@ def _download(name: str, release: Release, archive: Path) -> None:
     except Exception as error:  # of several libraries, for names, connections, certificates, status
         if "does not match the known hash" in str(error):
             raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
-        reason = shorten(str(error) or type(error).__name__, 200, placeholder=" …")
+        reason = str(error) or type(error).__name__
         raise InputError(f"{name} cannot be downloaded ({reason}); {by_hand}") from None

@@ -113,7 +113,7 @@ def always_valid(difference: float, variance: float, expected: float) -> tuple[f
 def compare_arms(
     paths: Sequence[str | Path],
     column: str = FEEDBACK,
-    arms: tuple[str, str] | None = None,
+    arms: Sequence[str] | None = None,
     expected: float | None = None,
     memory_limit: str = "2GB",
 ) -> Comparison:

@@ -3,8 +3,9 @@
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from tempfile import gettempdir
@@ -33,6 +34,8 @@ Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""
 Columns = LogMapping | Mapping[str, str] | str | Path
 """What the columns of logs mean, only the names of some, or a TOML file as of `--mapping`."""
+Resolved = tuple[tuple[Path, ...], LogMapping]
+"""Files of logs and what their columns mean."""
 _FRAME: Final = "frame.parquet"
 _KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
 _OPTIONS: Final = (
@@ -117,15 +120,9 @@ def prepare_store(
     columns, dataset = _read_columns(mapping), options.get("dataset", "generic")
     if "dataset" in options and not _are_paths(data):
         raise InputError(f"dataset is {dataset!r}, but only files have one; leave it out")
-    frame = None
-    if isinstance(data, LogFiles):
-        files, columns, dataset = data.files, columns.over(data.mapping), data.dataset
-    elif _are_paths(data):
-        adapter: Dataset = load_plugin("datasets", dataset)
-        files, columns = adapter.resolve(_list_paths(data), columns)
-    else:
-        frame = _write_frame(data, scratch)
-        files = (frame,)
+    adapter: Dataset = load_plugin("datasets", dataset)
+    files, columns, frame = _find_files(data, columns, adapter.resolve, scratch)
+    dataset = data.dataset if isinstance(data, LogFiles) else dataset
     with use_words_of_python(frame):
         how = PrepareOptions(**{**options, "dataset": dataset})
         _require_gap(options, how.session_by or columns.session_by)
@@ -190,15 +187,8 @@ def open_files(
     Raises:
         InputError: a path is missing, or the frame cannot be used.
     """
-    columns = _read_columns(mapping)
-    if isinstance(logs, LogFiles):
-        yield logs.files, columns.over(logs.mapping), None
-    elif _are_paths(logs):
-        yield *later_logs(trained, _list_paths(logs), columns), None
-    else:
-        with scratch_folder(Path(gettempdir()), "frame") as scratch:
-            file = _write_frame(logs, scratch)
-            yield (file,), columns, file
+    with scratch_folder(Path(gettempdir()), "frame") as scratch:
+        yield _find_files(logs, _read_columns(mapping), partial(later_logs, trained), scratch)
 
 
 def read_histories(
@@ -230,19 +220,26 @@ def read_histories(
     return histories if ids is None else select_users(histories, ids)
 
 
-def _write_frame(frame: Any, scratch: Path) -> Path:
+def _find_files(
+    logs: Any,
+    columns: LogMapping,
+    resolve: Callable[[Sequence[str | Path], LogMapping], Resolved],
+    scratch: Path,
+) -> tuple[tuple[Path, ...], LogMapping, Path | None]:
+    """Files of logs, their mapping, and the file in `scratch` to which a frame is written."""
+    if isinstance(logs, LogFiles):
+        return logs.files, columns.over(logs.mapping), None
+    if _are_paths(logs):
+        paths = [logs] if isinstance(logs, (str, Path)) else list(logs)
+        return *resolve(paths, columns), None
     file = scratch / _FRAME
-    pq.write_table(log_table(frame, "data"), file)
-    return file
+    pq.write_table(log_table(logs, "data"), file)
+    return (file,), columns, file
 
 
 def _are_paths(logs: object) -> bool:
     several = isinstance(logs, Sequence) and all(isinstance(path, (str, Path)) for path in logs)
     return isinstance(logs, (str, Path)) or several
-
-
-def _list_paths(logs: Any) -> list[str | Path]:
-    return [logs] if isinstance(logs, (str, Path)) else list(logs)
 
 
 @contextmanager

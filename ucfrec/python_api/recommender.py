@@ -346,7 +346,6 @@ class Recommender:
                 filter_seen=filter_seen,
                 liked=liked,
                 seed=seed,
-                checkpoint="best",
             )
 
     @_checked
@@ -377,7 +376,6 @@ class Recommender:
                 [_name_logs(logs)],
                 options=options,
                 seed=seed,
-                checkpoint="best",
             )
 
     @_checked
@@ -403,11 +401,10 @@ class Recommender:
         simulated = Environment(environment) if isinstance(environment, str) else environment
         return evaluate_in(
             simulated,
-            {trained.folder: (trained, rule or trained.rule)},
+            [(trained, rule or trained.rule)],
             beside,
             episodes=episodes,
             seed=seed,
-            checkpoint="best",
         )
 
     @_checked

@@ -388,7 +388,7 @@ def _write_graph(
         # The exporter's own message lists its steps; the reason is that of the error behind it.
         reason = one_line(str(error.__cause__ or error).strip()) or type(error).__name__
         raise InputError(
-            f"torch cannot export policies of kind {kind!r} ({reason:.160}); {remedy}"
+            f"torch cannot export policies of kind {kind!r} ({reason}); {remedy}"
         ) from None
 
 

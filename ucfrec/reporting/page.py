@@ -98,7 +98,8 @@ def render_report(
     Raises:
         InputError: a folder is not a run, or a file has no such rows or features.
     """
-    by_data = grouped(_read_runs(runs), lambda run: run.record.fingerprint)
+    read = _read_runs(runs)
+    by_data = grouped(read, lambda run: run.record.fingerprint)
     environments, estimates = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
@@ -107,7 +108,7 @@ def render_report(
             "estimates": draw_estimates(estimates),
             "forest": draw_forest(estimates),
         }
-    features = None if items is None else read_features(items)
+    features = None if items is None else read_features(items, [run.record.data for run in read])
     warnings, sections = [], []
     for group in by_data.values():
         for run in group:

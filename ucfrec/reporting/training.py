@@ -1,7 +1,7 @@
 """What the report shows of a training: quality of the data, curves, augmentation and samples."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -181,24 +181,31 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
         return str(samples["rule"]), tables
 
 
-def read_features(path: Path, text_ids: bool = False) -> pa.Table:
-    """Read item features with a column `item_id` from CSV (file name `.csv`), whose ids may stay as
-    they are written, or Parquet.
+def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = False) -> pa.Table:
+    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
+
+    Args:
+        logs: of runs; their own name of the column is accepted in the file, too.
+        text_ids: whether ids in CSV stay as they are written.
 
     Raises:
         InputError: the file cannot be read as that or lacks the column.
     """
     require_file(path, "name another file")
+    mapped = (log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID for log in logs)
+    names = dict.fromkeys((schema.ITEM_ID, *(name.strip('"') for name in mapped)))
     try:
-        types = csv.ConvertOptions(column_types={schema.ITEM_ID: pa.string()} if text_ids else None)
+        texts = dict.fromkeys(names, pa.string()) if text_ids else None
+        types = csv.ConvertOptions(column_types=texts)
         text = path.suffix == ".csv"
         table = csv.read_csv(path, convert_options=types) if text else pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path} cannot be read as Parquet or CSV: {reason}") from None
-    if schema.ITEM_ID not in table.column_names:
-        raise InputError(f"{path} has no column {schema.ITEM_ID!r}; add one with the item ids")
-    return table
+        raise InputError(f"{path} cannot be read as Parquet or CSV: {error}") from None
+    column = next((name for name in names if name in table.column_names), None)
+    if column is None:
+        wanted = " or ".join(map(repr, names))
+        raise InputError(f"{path} has no column {wanted}; add one with the item ids")
+    return table.rename_columns({column: schema.ITEM_ID})
 
 
 def _item_cells(

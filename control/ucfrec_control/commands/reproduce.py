@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
-from ucfrec.results.rows import ResultRow, latest, read_rows
+from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
@@ -108,7 +108,8 @@ class Reproduce(ControlGridOptions):
         else:
             cells += part.cells(self.require_data(), self.out, budget)
             how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-            rows = self.make_rows("", (), lambda: cells, how, f"reproduce {self.part}")
+            with benchmarking(results):
+                rows = self.measure(cells, how, f"reproduce {self.part}")
         pictures = self.out / self.part
         with self.explain_rows():
             if robust:

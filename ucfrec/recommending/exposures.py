@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
+from ucfrec.files.parquet import table_writer
 from ucfrec.recommending.recommend import RANK
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -65,7 +66,7 @@ def exposures_written(
             writer.write_table(table)
             yield frame
 
-    with atomic_file(path) as scratch, pq.ParquetWriter(scratch, columns) as writer:
+    with atomic_file(path) as scratch, table_writer(scratch, path, columns) as writer:
         yield write_all()
 
 

@@ -54,6 +54,8 @@ class Serve(AnswerOptions):
     max_batch: Annotated[int | None, _SERVER, "N"] = None
     max_queue: Annotated[int | None, _SERVER, "N"] = None
     timeout: Annotated[float | None, _SERVER, "TIMEOUT"] = None
+    max_connections: Annotated[int | None, _SERVER, "N"] = None
+    max_connections_of_address: Annotated[int | None, _SERVER, "N"] = None
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
@@ -119,6 +121,9 @@ class Serve(AnswerOptions):
             hosts = list_hosts(self.allowed_hosts, self.host)
             config = server_config(
                 application(served, limits, hosts, exposures, several),
+                limits.timeout,
+                limits.connections,
+                limits.connections_of_address,
                 timeout_graceful_shutdown=int(limits.timeout) + 1,
                 workers=self.workers,
             )

@@ -168,7 +168,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         ):
             counts = answer_stream(responder, source, sys.stdout.buffer, exposures=exposures)
         print(
-            f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors",
+            f"ucfrec recommend: {counts['answers']:,} answers, {counts['errors']:,} errors",
             file=sys.stderr,
         )
 

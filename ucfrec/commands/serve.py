@@ -141,7 +141,7 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.server import Server
 
         def make_server(config: "uvicorn.Config", what: str) -> Server:
-            server = Server(config, lambda _: parent.ready(what))
+            server = Server(config, lambda _: parent.report("ready", what))
             parent.ends(server)
             return server
 
@@ -154,7 +154,7 @@ class Serve(AnswerOptions):
             why = explanation(error)
             if why is None:
                 traceback.print_exc()
-            parent.failed(why or "a worker failed; see the traceback")
+            parent.report("failed", why or "a worker failed; see the traceback")
 
 
 def list_hosts(hosts: str | None, address: str) -> tuple[str, ...]:

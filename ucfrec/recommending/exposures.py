@@ -162,17 +162,7 @@ class ExposureLog:
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
         rows = [
-            (
-                user,
-                item,
-                now,
-                answer.request_id,
-                position,
-                chance,
-                answer.run,
-                answer.rule,
-                answer.arm,
-            )
+            (user, item, now, answer.request_id, position, chance, *answer[4:])  # run, rule, arm
             for user, now, answer in waiting
             for position, (item, chance) in enumerate(
                 zip(answer.items, answer.propensities, strict=True), 1

@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -172,13 +172,6 @@ class PrintingServer(Server):
         super().__init__(config, lambda at: print(ready_line(what, at, page), flush=True))
 
 
-class _Ends(Protocol):
-    """What `uvicorn.Server` is ended by."""
-
-    should_exit: bool
-    force_exit: bool
-
-
 class Parent:
     """The parent process, in a worker: receives what the worker reports, and ends it.
 
@@ -190,26 +183,21 @@ class Parent:
         self.first = first
         """Whether this is the one of the workers that says what all would say."""
         self._connection, self._lock = connection, threading.Lock()
-        self._server: _Ends | None = None
+        self._server: uvicorn.Server | None = None
         self._closed, self._close = get_context().Pipe(duplex=False)
         self._thread = threading.Thread(target=self._watch, name="parent", daemon=True)
         self._thread.start()
 
-    def ends(self, server: _Ends) -> None:
+    def ends(self, server: uvicorn.Server) -> None:
         """From now on the parent ends a server; before, it ends the process, which serves no one
         yet."""
         with self._lock:
             self._server = server
 
-    def ready(self, what: str) -> None:
-        """Report that the worker answers, and with what."""
+    def report(self, news: Literal["ready", "failed"], text: str) -> None:
+        """Report that the worker answers, and with what; or what failed."""
         with suppress(OSError):  # the parent has ended
-            self._connection.send(("ready", what))
-
-    def failed(self, why: str) -> None:
-        """Report why the worker cannot start."""
-        with suppress(OSError):
-            self._connection.send(("failed", why))
+            self._connection.send((news, text))
 
     def close(self) -> None:
         """End the thread that listens to the parent: Python ends in order only without it."""

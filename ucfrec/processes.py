@@ -68,8 +68,11 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 
 def _handle_signals(handler: Any) -> dict[signal.Signals, Any]:
-    """Set the handler of Ctrl-C and TERM; returns those that they had."""
+    """Set the handler of Ctrl-C and TERM; returns those that they had. HUP, of a terminal that is
+    closed, counts as TERM, unless it is ignored, as under nohup."""
     ending = (signal.SIGINT, signal.SIGTERM)
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
     return {number: signal.signal(number, handler) for number in ending}
 
 

@@ -231,20 +231,22 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
 
     filter_seen: bool = False
     out: Annotated[Path, OUTPUT]
-    """Parquet file (with --engine spark: folder) to write."""
+    """Parquet or CSV file (with --engine spark: folder) to write; ope reads Parquet."""
     engine: Literal["torch", "spark"] = "torch"
     """What computes the probabilities: this process; or Spark's workers, each for some of the
     users, which write the parts of a folder --out"""
 
     def execute(self) -> None:
-        """Write the policy's probability of every logged choice as Parquet."""
-        from ucfrec.files.parquet import write_frames
+        """Write the policy's probability of every logged choice."""
+        from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.logs.summary import format_report
         from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
 
+        if (master := self.find_spark()) is None:
+            require_table_names([self.out])
         trained = self.load(self.run)
         rule = self.make_rule(trained)
-        if (master := self.find_spark()) is not None:
+        if master is not None:
             from ucfrec.off_policy.scored import score_with_spark
 
             files, mapping = self.find_logs(self.logs, trained, [self.out])

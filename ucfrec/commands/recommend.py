@@ -32,7 +32,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()
     """Log files, folders or globs; also at s3://, …"""
     out: Annotated[Path | None, OUTPUT] = None
-    """Parquet file (with --engine spark: folder) to write."""
+    """Parquet or CSV file (with --engine spark: folder) to write."""
     stream: bool = False
     """Instead of LOGS and --out: read requests from stdin, JSON on each line, and write answers to
     stdout; see docs/serving.md"""
@@ -49,7 +49,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     seconds at the start; with spark, each worker writes a part of the folder --out"""
 
     def execute(self) -> None:
-        """Write the recommendations as Parquet, or answer a stream."""
+        """Write the recommendations, or answer a stream."""
         if self.stream:
             self._answer_stream()
             return
@@ -57,12 +57,13 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             raise InputError(
                 "name LOGS after the run and the file to write with --out; or give --stream"
             )
-        from ucfrec.files.parquet import write_frames
+        from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.recommending.histories import histories_of_files
         from ucfrec.recommending.recommend import recommend
 
+        if (master := self.find_spark()) is None:
+            require_table_names([self.out, self.exposures])
         trained, index = self.load(self.run), None
-        master = self.find_spark()
         files, mapping = self.find_logs(self.logs, trained, [self.out, self.exposures])
         how: Any = {
             "rule": (rule := self.make_rule(trained)),
@@ -163,7 +164,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         ):
             counts = answer_stream(responder, source, sys.stdout.buffer, exposures=exposures)
         print(
-            f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors",
+            f"ucfrec recommend: {counts['answers']:,} answers, {counts['errors']:,} errors",
             file=sys.stderr,
         )
 

@@ -54,6 +54,8 @@ class Serve(AnswerOptions):
     max_batch: Annotated[int | None, _SERVER, "N"] = None
     max_queue: Annotated[int | None, _SERVER, "N"] = None
     timeout: Annotated[float | None, _SERVER, "TIMEOUT"] = None
+    max_connections: Annotated[int | None, _SERVER, "N"] = None
+    max_connections_of_address: Annotated[int | None, _SERVER, "N"] = None
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
@@ -122,6 +124,9 @@ class Serve(AnswerOptions):
             hosts = list_hosts(self.allowed_hosts, self.host)
             config = server_config(
                 application(served, limits, hosts, exposures, several),
+                limits.timeout,
+                limits.connections,
+                limits.connections_of_address,
                 timeout_graceful_shutdown=int(limits.timeout) + 1,
                 workers=self.workers,
             )
@@ -139,7 +144,7 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.server import Server
 
         def make_server(config: "uvicorn.Config", what: str) -> Server:
-            server = Server(config, lambda _: parent.ready(what))
+            server = Server(config, lambda _: parent.report("ready", what))
             parent.ends(server)
             return server
 
@@ -152,7 +157,7 @@ class Serve(AnswerOptions):
             why = explanation(error)
             if why is None:
                 traceback.print_exc()
-            parent.failed(why or "a worker failed; see the traceback")
+            parent.report("failed", why or "a worker failed; see the traceback")
 
 
 def list_hosts(hosts: str | None, address: str) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ class Join(LogOptions, Exposures):
     within: Annotated[str, "TIME"]
     """Longest time from exposure to feedback: 90s, 30m, 2h, 1d."""
     out: Annotated[Path, OUTPUT]
-    """Parquet log to write."""
+    """Parquet or CSV log to write."""
 
     def execute(self) -> None:
         """Print what was matched."""

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import best_items
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore, UserRows
@@ -167,8 +168,8 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
         if batch.left_out is not None:
             scores = scores.expand(len(numbers), n_items).clone()
             scores[batch.left_out] = -torch.inf
-        best, top = scores.topk(k, dim=1)
-        listed_items = top.masked_fill(torch.isneginf(best), -1)
+        top = best_items(scores, k)
+        listed_items = top.masked_fill(torch.isneginf(scores.gather(1, top)), -1)
         parts.append(listed_items.expand(len(numbers), k).numpy())
     return Ranked(_first_scores(ranker, later, at_once), np.concatenate(parts))
 

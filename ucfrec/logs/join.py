@@ -11,9 +11,9 @@ import duckdb
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files, scratch_folder
+from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.sessions import write_batches
 from ucfrec.logs.summary import note_undefined
 from ucfrec.logs.tables import (
     PANDAS_INDEX,
@@ -101,14 +101,15 @@ def join_feedback(
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
-        out: Parquet file: the columns of the exposures, `feedback` and those of the feedback. Where
-            the exposures are a log of this function, `feedback` counts both, and of a number that
-            both have it is the larger value.
+        out: Parquet or CSV file: the columns of the exposures, `feedback` and those of the
+            feedback. Where the exposures are a log of this function, `feedback` counts both, and of
+            a number that both have it is the larger value.
         mapping: log columns to the columns of the feedback, and which of its rows count.
 
     Raises InputError if a file or column is missing, or of a wrong type; a file of feedback is one
     of exposures; or `out` is one of them.
     """
+    require_table_names([out])
     shown_files, feedback_files = log_files(exposures), log_files(feedback)
     files = [*shown_files, *feedback_files]
     require_other_files([out], files)
@@ -350,8 +351,10 @@ def _write(
         "JOIN feedback f ON f.row = m.feedback_row GROUP BY m.row) USING (row) "
         "ORDER BY exposures.row"
     )
-    with atomic_file(out) as scratch:
-        write_batches(scratch, connection.sql(query).to_arrow_reader(BATCH_ROWS))
+    batches = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with atomic_file(out) as scratch, table_writer(scratch, out, batches.schema) as writer:
+        for batch in batches:
+            writer.write_batch(batch)
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ucfrec import __version__, schema
+from ucfrec.acting.decision import best_items
 from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
@@ -346,7 +347,7 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
     episodes = long_enough[places.astype(np.int64)]
     last = validation.lengths[episodes] - 1
     scores = logged_scores(scorer, validation, episodes, last)
-    best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
+    best = best_items(scores, min(_ITEMS, scores.shape[1]))
     sessions = []
     for place in range(len(episodes)):
         session = validation.select(episodes[[place]])
@@ -356,7 +357,7 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
                 "history": items[:-1][-_HISTORY:].tolist(),
                 "rewards": rewards[:-1][-_HISTORY:].tolist(),
                 "logged": int(items[-1]),
-                "recommended": best.indices[place].tolist(),
+                "recommended": best[place].tolist(),
             }
         )
     return {"rule": str(scorer.rule), "sessions": sessions}

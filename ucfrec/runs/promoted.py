@@ -38,6 +38,15 @@ class Promoted(Record):
             raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
         return folder / self.current
 
+    def require_same(self, trained: TrainedPolicy) -> None:
+        """Check that a run of that name is the one that was promoted, or raise InputError."""
+        if self.fingerprint not in ("", trained.fingerprint):
+            raise InputError(
+                f"{trained.folder} is not the run that was promoted: {POINTER} has the fingerprint "
+                f"{self.fingerprint}, the run {trained.fingerprint}; restore that run, or "
+                "promote this one with --force"
+            )
+
 
 def promoted(folder: Path) -> Promoted | None:
     """What the pointer file of a folder says, None without one; InputError if it is damaged."""
@@ -65,7 +74,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
             return _write(run, fingerprint, ())
         again = pointer.current == run.name
         if not force and not (again and pointer.fingerprint in ("", fingerprint)):
-            _require_verdict(run, pointer.run(folder))
+            _require_verdict(run, pointer)
         previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
         return _write(run, fingerprint, previous)
@@ -92,8 +101,8 @@ def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
     return pointer.write(run.parent)
 
 
-def _require_verdict(run: Path, current: Path) -> None:
-    update, fault = RunRecord.read(run).update, ""
+def _require_verdict(run: Path, pointer: Promoted) -> None:
+    update, fault, current = RunRecord.read(run).update, "", pointer.run(run.parent)
     if update is None or update.verdict is None:
         fault = f"has no verdict against the current run {current.name}"
     elif update.run != TrainedPolicy.load(current, split=True).fingerprint:
@@ -102,3 +111,4 @@ def _require_verdict(run: Path, current: Path) -> None:
         fault = f"is worse than {current.name} by its verdict"
     if fault:
         raise InputError(f"{run} {fault}; compare them, and add --force to promote it all the same")
+    pointer.require_same(TrainedPolicy.load(current))

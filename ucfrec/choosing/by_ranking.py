@@ -8,6 +8,7 @@ than the ten most liked ones do, by a standard error.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
+from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice, RuleRecord
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
@@ -173,16 +174,18 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     for half in (0, 1):
         own = _choose_best([candidate.select(users % 2 == half) for candidate in candidates])
         halves.append(own.rule.reward_weight)
+    details: dict[str, Any] = {"reward_weights_of_halves": halves}
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
-    return RuleChoice(
+    chosen = RuleRecord(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
         "liked items better than the ten most liked ones do, by a standard error; no propensities "
         f"are used; halves of the users choose reward weights {halves[0]:g} and {halves[1]:g}",
-        candidates=[candidate.summary for candidate in candidates],
+        tried=len(candidates),
         warning="" if best.overlaps else warning,
-        details={"reward_weights_of_halves": halves},
+        **details,
     )
+    return chosen, [candidate.summary for candidate in candidates]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import Evidence, ValueEstimate
+from ucfrec.choosing.choice import Evidence, RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.item_table import ITEM_STATES
@@ -34,7 +34,6 @@ from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
-from ucfrec.user_model.session_end import SessionEndReport
 
 _Report = TypeVar("_Report")
 RUN: Final = RUN_RECORD
@@ -116,22 +115,6 @@ class Candidate(Entry):
     """Mean return of a session in the user model; None for a rule that was not simulated."""
     error: Number | None = None
     evidence: Evidence | None = None
-
-
-class RuleRecord(Entry):
-    """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""
-
-    model_config = ConfigDict(extra="allow")
-
-    rule: SavedRule
-    chosen_by: Text
-    warning: Text = ""
-    tried: Count = 0
-    """Number of rules in the file `CANDIDATES`."""
-    estimate: ValueEstimate | None = None
-    halves_agree: tuple[bool, bool] | None = None
-    """Whether the sessions of either half of the users would choose the rule, too."""
-    session_end: SessionEndReport | None = None
 
 
 class Difference(Entry):

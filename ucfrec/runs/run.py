@@ -17,7 +17,7 @@ from ucfrec import __version__, schema
 from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
-from ucfrec.choosing.choice import Problem
+from ucfrec.choosing.choice import Problem, RuleRecord
 from ucfrec.counterfactual.augmentation import (
     MODELS,
     AugmentationReport,
@@ -44,7 +44,6 @@ from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
     CANDIDATES,
     RUN,
-    RuleRecord,
     RunRecord,
     place_of,
     read_augmentation,
@@ -312,10 +311,12 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
         run.config.seed,
         None if initial is None else rule_to_start_from(initial, trained),
     )
-    choice = choose_by_simulation(problem) if returns.per_session else choose_by_ranking(problem)
-    write_json(run.out / RULE, choice.rule.as_dict())
-    write_json(run.out / CANDIDATES, choice.list_candidates())
-    return RuleRecord.model_validate(choice.as_dict())
+    choose = choose_by_simulation if returns.per_session else choose_by_ranking
+    chosen, candidates = choose(problem)
+    write_json(run.out / RULE, chosen.rule.as_dict())
+    entries = [{**asdict(entry), "rule": entry.rule.as_dict()} for entry in candidates]
+    write_json(run.out / CANDIDATES, entries)
+    return chosen
 
 
 def _dependencies(

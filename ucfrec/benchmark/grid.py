@@ -72,7 +72,7 @@ def run_grid(
     if again:
         remove_rows(results, [task.key for task in tasks.values()])
         for task in tasks.values():
-            for folder in (task.cell.run, task.cell.shared.folder):
+            for folder in (task.cell.run, task.cell.shared):
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
     earlier = read_rows(results)

@@ -6,8 +6,6 @@ The file names the current run and those before it, the latest last.
 from pathlib import Path
 from typing import ClassVar, Final
 
-from pydantic import Field
-
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
 from ucfrec.files.record import Record, Text
@@ -15,8 +13,6 @@ from ucfrec.runs.record import RunRecord, verify_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 POINTER: Final = "promoted.json"
-_MOST: Final = 1000
-"""Earlier runs that are remembered."""
 
 
 class Promoted(Record):
@@ -30,7 +26,7 @@ class Promoted(Record):
     """Name of the run folder, beside the file."""
     fingerprint: Text = ""
     """Of the run as it was promoted; empty in a file of an earlier version."""
-    previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
+    previous: tuple[Text, ...] = ()
 
     def run(self, folder: Path) -> Path:
         """The folder of the current run; InputError if it does not lie beside the file."""
@@ -75,7 +71,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
         again = pointer.current == run.name
         if not force and not (again and pointer.fingerprint in ("", fingerprint)):
             _require_verdict(run, pointer)
-        previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
+        previous = pointer.previous if again else (*pointer.previous, pointer.current)
         # Written again too, so that a server tries again what it could not use.
         return _write(run, fingerprint, previous)
 

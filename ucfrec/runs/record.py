@@ -373,23 +373,14 @@ def verify_run(run: Path) -> None:
 
 
 def _describe_augmentation(report: AugmentationReport) -> list[str]:
-    crm, moves, actions = report.reward_model, report.moves, report.actions
-    lines = [
-        f"reward model  R² {crm.r2:.3f} with the disturbance z, {crm.r2_without_z:.3f} without; "
-        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active"
-    ]
+    lines = []
     if report.proposals:
         lines.append(
             f"augmentation  {report.copies:,} augmented episodes, {report.acceptance:.1%} of their "
-            f"edits accepted; mean-move ratio {moves.mean_move_ratio:.2f}, effective rank "
-            f"{moves.effective_rank:.1f} of {moves.dimensions}"
+            "edits accepted"
         )
-    if actions is not None:
-        lines.append(
-            f"other actions {actions.copies:,} augmented steps of {actions.proposals:,} proposed; "
-            f"their reward differs by {actions.mean_change:+.3g} on average, "
-            f"{actions.earns_more:.0%} have a higher one than the logged action"
-        )
+    if (actions := report.actions) is not None:
+        lines.append(f"other actions {actions.copies:,} augmented steps of {actions.proposals:,}")
     lines.append(
         f"bound         δ + ε_r = {report.delta:.3g} + {report.epsilon_r:.3g}: {report.verdict}"
     )
@@ -410,19 +401,11 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
             f"{indent}It ranked best of {choice.tried} rules in the validation period.",
             f"{indent}Selected by the {choice.chosen_by}{choice.warning}",
         ]
-    doubts = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
-    if choice.halves_agree is not None:
-        would = ("both choose another", "one chooses this rule", "both choose this rule")
-        doubts.append(would[sum(choice.halves_agree)])
-    if estimate.optimism is not None:
-        off, error = estimate.optimism
-        doubts.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
     lines += [
         f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
         "simulated users, it has the best return",
         f"{indent}(or one level with it) that the log supports: {estimate.value:.4g} ± "
         f"{estimate.error:.2g} per session, estimated; logged sessions have {logged:.4g}.",
-        f"{indent}{'; '.join(doubts)}.",
         *(f"{indent}WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts),
     ]
     lines[-1] += choice.warning.replace("; WARNING", f"\n{indent}WARNING")

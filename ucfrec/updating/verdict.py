@@ -55,13 +55,8 @@ def compare_runs(
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, seen)
     old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
-    if liked.any():
-        gained = (new_gain - old_gain) * liked
-        differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
-    else:
-        differences = [
-            Difference(measure=RANKING, value=0, low=0, high=0, doubt="no step was liked")
-        ]
+    gained = (new_gain - old_gain) * liked
+    differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
     if schema.PROPENSITY in rows.record.columns:
         propensity = rows.column(schema.PROPENSITY).astype(np.float64)
         if (weighed := propensity > 0).any():
@@ -124,7 +119,7 @@ def _compare(
     doubt: str = "",
 ) -> Difference:
     """The ratio of sums over steps (N,), with its interval over users."""
-    low = high = value = float(above.sum() / below.sum())
+    low = high = value = float(above.sum() / (below.sum() or 1))
     users = len(np.unique(user[below > 0]))
     if users < FEWEST_USERS:
         doubt = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"

@@ -143,12 +143,7 @@ class LoggedRewards:
     expected reward, as what follows, such as the session's end, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        batches = store.column_batches(schema.REWARD)
-        parts = [np.unique(rewards, return_counts=True) for (rewards,) in batches]
-        distinct = np.concatenate([values for values, _ in parts])
-        numbers = np.concatenate([counts for _, counts in parts])
-        rewards, place = np.unique(distinct, return_inverse=True)
-        counts = np.bincount(place, numbers)
+        rewards, counts = np.unique(store.column(schema.REWARD), return_counts=True)
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]
         if len(values) > _GROUPS:
             middle = (counts.cumsum() - counts / 2) / counts.sum()

@@ -17,7 +17,7 @@ from ucfrec.runs.record import Difference, UpdateResult, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_report import (
     RewardRows,
-    calibration,
+    calibration_error,
     draw_steps,
     fit_line,
     score_rows,
@@ -220,14 +220,14 @@ def measure_drift(
     if model is None or not in_catalogue.any():
         return measures
     reward_rows = RewardRows.at(sample, episodes[in_catalogue], steps[in_catalogue], model.reach)
-    scores = score_rows(model, reward_rows)[0]
+    scores = score_rows(model, reward_rows)
     predicted = model.expect(scores).double().numpy()
     observed = reward_rows.rewards.double().numpy()
     slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))
     return measures | {
         "predicted": float(predicted.mean()),
         "observed": float(observed.mean()),
-        "calibration_error": calibration(predicted, observed).error,
+        "calibration_error": calibration_error(predicted, observed),
         "slope": slope,
     }
 

@@ -96,7 +96,7 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(trained: TrainedPolic
     candidates = read_json(trained.folder / "candidates.json")
     best = max(candidates, key=lambda each: each["value"])
     own = next(each for each in candidates if each["rule"] == rule["rule"])
-    assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
+    assert own["value"] >= best["value"] - best["error"] or best["items"] < 2
     assert found.rule is not None
     assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
     estimate = found.rule.estimate
@@ -228,13 +228,13 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
     one = {"temperatures": (1.0,), "reward_weights": (0.0,)}
     config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), **one)
-    found, _ = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
-    fatigue = found.model_dump()["fatigue"]
-    assert (fatigue["length"], fatigue["steps"]) == (3, 4)
+    found, candidates = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
+    fatigue = users_of(tmp_path, store).fatigue
+    assert (fatigue.length, fatigue.steps) == (3, 4)
     assert found.rule.tag_run == 2
-    unlimited, _ = chosen(scorer, store, tmp_path, replace(config, tag_runs=(0,)), 2.0, 3.0)
-    for choice, runs in ((found, FEW.tag_runs), (unlimited, (0,))):
-        assert {candidate.rule.tag_run for candidate in choice.candidates} == {*runs}
+    _, unlimited = chosen(scorer, store, tmp_path, replace(config, tag_runs=(0,)), 2.0, 3.0)
+    for tried, runs in ((candidates, FEW.tag_runs), (unlimited, (0,))):
+        assert {candidate.rule.tag_run for candidate in tried} == {*runs}
 
 
 def test_rules_of_the_highest_value_are_simulated_in_more_sessions(trained: TrainedPolicy) -> None:
@@ -261,15 +261,14 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert record.reward_model is not None
     assert record.rule is not None
     assert record.reward_model.new_users
-    choice = record.rule.model_dump()
-    users = choice["users"]
-    assert list(users["calibration"]) == choice["calibration"]
     # Nothing that acts knows these tastes.
     trained = TrainedPolicy.load(tmp_path / "run")
     model = trained.reward_model
     assert model is not None
     assert not model.affinity.any()
     assert not model.user.any()
+    users = users_of(tmp_path / "run", store)
+    assert users.training_users.report.calibration == users.calibration
     # The chosen rule was simulated again in four times the sessions.
     more = search_of(trained, replace(config.rule, sessions=60))
     (simulated,) = more.simulate([trained.rule])

@@ -8,7 +8,6 @@ than the ten most liked ones do, by a standard error.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -170,20 +169,14 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         if ranked[nearest].overlaps:
             break
         best = rank([(weight + nearest) / 2])
-    halves = []
-    for half in (0, 1):
-        own = _choose_best([candidate.select(users % 2 == half) for candidate in candidates])
-        halves.append(own.rule.reward_weight)
-    details: dict[str, Any] = {"reward_weights_of_halves": halves}
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
     chosen = RuleRecord(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
         "liked items better than the ten most liked ones do, by a standard error; no propensities "
-        f"are used; halves of the users choose reward weights {halves[0]:g} and {halves[1]:g}",
+        "are used",
         tried=len(candidates),
         warning="" if best.overlaps else warning,
-        **details,
     )
     return chosen, [candidate.summary for candidate in candidates]
 
@@ -202,17 +195,13 @@ class _Candidate:
     ahead: Float64Array
     """(M,) 1 for a liked item that only the rule shows, −1 for one that only the baseline does."""
 
-    def select(self, rows: BoolArray) -> "_Candidate":
-        names = ("users", "rates", "liked", "hits", "ahead")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
-
     @cached_property
     def summary(self) -> RankedRule:
         count = max(1, int(self.liked.sum()))
         gain = float(self.ahead.sum()) / count
         return RankedRule(
             rule=self.rule,
-            item_rate=float(self.rates.mean()) if len(self.rates) else 0.0,
+            item_rate=float(self.rates.mean()),
             hits=float(self.hits[self.liked].sum()) / count,
             gain=gain,
             gain_error=self._error_of_sum(self.ahead - gain * self.liked) / count,
@@ -226,7 +215,7 @@ class _Candidate:
     def levels_with(self, top: "_Candidate") -> bool:
         """Whether the rate is not below that of another rule by more than a standard error."""
         below = top.rates - self.rates
-        return not len(below) or bool(below.sum() <= self._error_of_sum(below - below.mean()))
+        return bool(below.sum() <= self._error_of_sum(below - below.mean()))
 
     def _error_of_sum(self, values: Float64Array) -> float:
         """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""

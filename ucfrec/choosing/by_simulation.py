@@ -239,7 +239,6 @@ class RuleSearch:
             rule=rule,
             value=float(sessions.returns.mean()),
             error=_standard_error(sessions.returns),
-            length=float(sessions.lengths.mean()),
             support=float(self._supported[sessions.items].mean()),
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
@@ -399,7 +398,6 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         candidates = [*(item for item in candidates if item.rule not in again), *finalists]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
-    details = dict(search.users.report, least_items=search.least_items)
     chosen = RuleRecord(
         rule=best.rule,
         chosen_by=f"mean return of simulated sessions{where}",
@@ -407,7 +405,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         tried=len(candidates),
         estimate=estimate,
         halves_agree=agree,
-        **details | {"least_users": search.least_users},
+        session_end=search.users.session_end_report,
     )
     return chosen, [best if item.rule == best.rule else item for item in candidates]
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from ucfrec.acting.decision import DecisionRule, SavedRule
 from ucfrec.acting.scorer import Scorer
@@ -121,7 +121,6 @@ class SimulatedRule:
     value: float
     """Mean return of a session, in reward units."""
     error: float
-    length: float
     support: float
     """Share of decisions on items that the log supports."""
     items: float
@@ -164,8 +163,6 @@ class RankedRule:
 
 class RuleRecord(Entry):
     """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""
-
-    model_config = ConfigDict(extra="allow")
 
     rule: SavedRule
     chosen_by: Text

@@ -113,7 +113,6 @@ class Candidate(Entry):
     rule: SavedRule
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
-    error: Number | None = None
     evidence: Evidence | None = None
 
 

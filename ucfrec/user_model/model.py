@@ -1,6 +1,6 @@
 """The user model, reward of every item, session ends and fatigue, and sessions simulated in it."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -54,8 +54,6 @@ class UserModel:
     main_tags: MainTags
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new."""
-    report: dict[str, Any] = field(default_factory=dict)
-    """What simulated sessions are drawn from, as a JSON object."""
 
     @classmethod
     def fit(
@@ -116,7 +114,6 @@ class UserModel:
                 fatigue=of_fatigue and Fatigue(**of_fatigue),
                 main_tags=tags,
                 calibration_report=of_calibration and UserCalibration(**of_calibration),
-                report={**metadata, "users": users and asdict(users.report)},
             )
 
     @property

@@ -13,7 +13,6 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.provenance import config_hash
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.run import OWN, SharedStages
 from ucfrec.runs.screened import SCREENING
 
 Presets = Mapping[str, Mapping[str, Any]]
@@ -165,8 +164,8 @@ class Cell:
     """None for a built-in policy, as are `store` and `run`."""
     store: Path | None = None
     run: Path | None = None
-    shared: SharedStages = OWN
-    """Reward models and augmentation that methods have in common."""
+    shared: Path | None = None
+    """Folder of reward models and augmentation that methods have in common."""
     settings: tuple[str, ...] = ()
     presets: Presets = field(default_factory=dict)
     """Defaults of the training for its data, below `settings`."""
@@ -268,7 +267,7 @@ class Plan:
                     training_seed=seed,
                     store=task.store,
                     run=run.with_name(f"{run.name}-{seed}"),
-                    shared=SharedStages(self.folder / "stages"),
+                    shared=self.folder / "stages",
                     conditioned=method.conditioned,
                     conditions={**task.conditions, **(conditions or {})},
                     **training,

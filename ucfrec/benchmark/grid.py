@@ -50,7 +50,7 @@ def run_grid(
     if again:
         remove_rows(results, [key for key, _ in tasks.values()])
         for _, cell in tasks.values():
-            for folder in (cell.run, cell.shared.folder):
+            for folder in (cell.run, cell.shared):
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
     earlier = read_rows(results)

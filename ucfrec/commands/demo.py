@@ -201,7 +201,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     from ucfrec.evaluation.evaluate import evaluate_policy
     from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
-    from ucfrec.runs.run import SharedStages, train_run
+    from ucfrec.runs.run import train_run
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     torch.set_num_threads(1)
@@ -209,7 +209,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     size = [f"policy.dim={config.dim}"]
     size += [] if policy == "bc" else [f"policy.context={config.context}"]
     resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
-    run, shared = folder / name, SharedStages(folder / "stages")
+    run, shared = folder / name, folder / "stages"
     with label_progress(f"{folder.name}, {name}"):
         train_run(EpisodeStore.open(folder / "store"), run, resolved, shared=shared)
         trained, environment = TrainedPolicy.load(run), Environment(folder.name)

@@ -78,10 +78,11 @@ class Update(LogOptions, RunArgument):
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        run = self.run
-        if not (run / RUN).is_file() and (current := promoted(run)) is not None:
-            run = current.run(run)
+        pointer = None if (self.run / RUN).is_file() else promoted(self.run)
+        run = self.run if pointer is None else pointer.run(self.run)
         old = TrainedPolicy.load(run)
+        if pointer is not None:
+            pointer.require_same(old)
         files, mapping = self.find_logs(self.logs, old, [self.out])
         append = AppendOptions(
             window_ms=None if self.window is None else read_duration("--window", self.window),

@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import Annotated, Any, Literal
 
+import pyarrow as pa
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
@@ -203,11 +204,13 @@ def read_log(
     store: Path | None = None,
     grows: bool = False,
     keep_unknown: bool = False,
+    held: pa.Table | None = None,
 ) -> Iterator[PreparedLog]:
     """Sort and count a log; users and items of a `store` keep their numbers.
 
     If it `grows`, the log is added to it, and other ids follow; if not, it is evaluated on: a
-    single split, no features, and other items only with `keep_unknown`.
+    single split, no features, and other items only with `keep_unknown`. Rows of `held` (user, item,
+    time) count as duplicates.
     """
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
@@ -236,7 +239,9 @@ def read_log(
                 else:
                     log = open_log(opened, spill, sessions.list_text_ids(store))
                     by_session = log.session_by == schema.SESSION_ID
-                    rows = sort_rows(log, known_items, options.duplicates, scratch, by_session)
+                    rows = sort_rows(
+                        log, known_items, options.duplicates, scratch, by_session, held
+                    )
                 log = rows.log
                 summary.require_rows(log, rows.count, rows.dropped, store if grows else None)
                 summary.note_losses(rows, reward, mapping.where)

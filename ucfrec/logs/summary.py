@@ -256,10 +256,10 @@ def require_rows(
     if count:
         return
     n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
-    if grown is not None and late and late == n_wanted:
-        (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
+    if grown is not None and 0 < n_wanted == late + dropped["duplicate"]:
+        before = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.earliest_ms - 1}"
         # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
-        if EARLIEST_MS <= latest < log.earliest_ms:
+        if log.one(f"SELECT count(*) FROM {ROWS} WHERE {before}")[0] >= late:
             raise NoRowsError(
                 f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
                 f"of {_clock(log.earliest_ms - 1)} UTC; give newer logs"

@@ -28,7 +28,7 @@ from ucfrec.processes import block_ctrl_c, label_progress, pool_of_processes
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.runs.config import Config
-from ucfrec.runs.run import SharedStages, train_run
+from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -253,7 +253,7 @@ def _measure_trial(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
     trial.set_user_attr(POLICY, policy)
     config = plan.search.config(policy, values)
     run = _name_run(plan, config)
-    shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
+    shared, callbacks = plan.out / STAGES, Callbacks(on_validation=stop_hopeless)
     try:
         with label_progress(f"trial {trial.number}"):
             train_run(store, run, config, shared=shared, callbacks=callbacks)

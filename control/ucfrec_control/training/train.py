@@ -13,7 +13,6 @@ from ucfrec.policies.registry import BUILT_IN, policy_names
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.run import OWN, SharedStages
 from ucfrec.runs.screened import train_screened
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
@@ -86,7 +85,7 @@ def train_control(
     config: Config,
     *,
     screening: str | None = None,
-    shared: SharedStages = OWN,
+    shared: Path | None = None,
 ) -> RunRecord:
     """`ucfrec.runs.screened.train_screened` on a control store; `screening` is its `how`.
 

@@ -16,7 +16,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.run import SharedStages
 from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS
@@ -93,7 +92,7 @@ def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     # Begun here, where screening may be made quick, and gone on with by the command.
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
-    runs, stages = {}, SharedStages(tmp_path / "stages")
+    runs, stages = {}, tmp_path / "stages"
     for cell in plan.robustness_cells(tmp_path, out, budget):
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:

@@ -8,7 +8,13 @@ from ucfrec.commands.options import Names
 from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.training.train import control_policies, dataset_of, preset_of, train_control
+from ucfrec_control.training.train import (
+    control_policies,
+    dataset_of,
+    describe_returns,
+    preset_of,
+    train_control,
+)
 
 
 class Train(TrainingOptions):
@@ -26,4 +32,5 @@ class Train(TrainingOptions):
         config = resolve_config(self.policy, self.config, self.set, self.seed, preset.tables)
         record = train_control(store, self.out, config, screening=self.screen)
         print(record.describe())
+        print(describe_returns(store))
         print(f"\nrun: {self.out}; TensorBoard can open it")

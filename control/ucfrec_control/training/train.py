@@ -7,6 +7,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.policies.registry import BUILT_IN, policy_names
@@ -78,6 +80,18 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
     """The preset of a method on the dataset that `dataset_of` describes."""
     task = find_task(dataset["env_id"], dataset["dataset"])
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
+
+
+def describe_returns(store: EpisodeStore) -> str:
+    """What the logged trajectories returned, which a policy is compared with: two lines of text."""
+    dataset, returns = dataset_of(store), np.sort(store.returns)
+    task = find_task(dataset["env_id"], dataset["dataset"])
+    parts = {"behaviour": returns, "best quarter": returns[-max(1, len(returns) // 4) :]}
+    return "\n".join(
+        f"{name:13} mean return {values.mean():.4g} of {len(values):,} logged trajectories"
+        + (f", score {task.score(values.mean()):.1f}" if task else "")
+        for name, values in parts.items()
+    )
 
 
 def train_control(

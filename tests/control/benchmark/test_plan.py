@@ -29,7 +29,7 @@ from ucfrec_control.benchmark.methods import (
 from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
 from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store
-from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.training.evaluate import load_run
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import find_preset
@@ -37,7 +37,7 @@ from ucfrec_control.training.train import find_preset
 
 def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     """Configuration of every row of a table that the core trains."""
-    task, kind, configs = require_task(file).name, find_kind(file), {}
+    task, kind, configs = find_task(file).name, find_kind(file), {}
     for name, method in TABLES[table].items():
         if method.policy not in ALGORITHMS:
             presets = find_preset(task, kind, method.policy).tables

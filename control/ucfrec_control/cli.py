@@ -11,7 +11,7 @@ CONTROL = Program(
     "ucfrec_control.commands",
     {
         "prepare": "convert a dataset to an episode store",
-        "collect": "collect datasets with a SAC agent, or a saved one",
+        "collect": "record a dataset of a saved agent",
         "convert": "convert D4RL HDF5 to Minari, or back",
         "distract": "add a distractor to the states of a store",
         "screen": "find state dimensions that have no effect",

@@ -32,7 +32,7 @@ NEEDS = {
     "moves": _COPIES,
     "states": _COPIES,
     "acceptance": _COPIES,
-    "attention": "a run of ucf among --runs (`ucfrec-control train --policy ucf`)",
+    "attention": "a run of ucf or ucf-paper among --runs (`ucfrec-control train --policy ucf`)",
     "training": "a run among --runs (`ucfrec-control train`)",
     "returns": "rows of one dataset with two target returns or more among --results "
     "(`ucfrec-control evaluate --target … --target … --json`)",
@@ -44,6 +44,8 @@ NEEDS = {
 }
 """What every kind of figure is made of."""
 _REMEDY = "measure it again"
+_SWEPT = re.compile(r"(ucf-paper|ucf)(-lambda-.+)?$")
+"""Methods that differ in λ only."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
 def _plan_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
     for run, *_ in grouped(runs, lambda run: (run.group, run.method)).values():
         kinds = ("moves", "states", "acceptance") if diagnostics.is_augmented(run.path) else ()
-        for kind in (*kinds, *(("attention",) if run.policy == "ucf" else ())):
+        for kind in (*kinds, *(("attention",) if run.policy in ("ucf", "ucf-paper") else ())):
             yield _Plan(kind, run.name, partial(_draw_run, run, kind))
     for group, same in grouped(runs, lambda run: run.group).items():
         yield _Plan("training", group, partial(_training, same))
@@ -207,15 +209,24 @@ def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     targets = [row for row in clean if row.suite == EVALUATE and row.target_return is not None]
     yield from _plan_targets(targets)
     swept = [
-        row.as_line()
+        row
         for row in clean
-        if (row.method == "ucf" or row.method.startswith("ucf-lambda"))
+        if _SWEPT.match(row.method)
         and row.table in ("lambda", EVALUATE)
         and row.conditions.get("lambda_mask") is not None
     ]
-    for budget, budget_rows in grouped(swept, lambda line: line.get("budget", "rows")).items():
-        if len({line["lambda_mask"] for line in budget_rows}) > 1:
-            yield _Plan("lambda", budget, partial(plots.lambda_curves, budget_rows))
+    families = grouped(swept, lambda row: (row.conditions.get("budget", "rows"), _family(row)))
+    for (budget, family), rows_of_family in families.items():
+        lines = [row.as_line() for row in rows_of_family]
+        if len({line["lambda_mask"] for line in lines}) > 1:
+            name = f"{budget}-{family}".removesuffix("-ucf")
+            yield _Plan("lambda", name, partial(plots.lambda_curves, lines))
+
+
+def _family(row: ResultRow) -> str:
+    """The method whose λ a row varies."""
+    matched = _SWEPT.match(row.method)
+    return "" if matched is None else matched[1]
 
 
 def _plan_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:

@@ -35,7 +35,7 @@ class Evaluate(Table):
     target: Annotated[Sequence[float | None], target_given] = ()
     """Target return, or max for the largest that the policy expects in each state; repeatable
     (default: the preset's)"""
-    checkpoint: Literal["both", "best", "last"] = "both"
+    checkpoint: Literal["both", "best", "last", "return"] = "both"
     """Weights to evaluate."""
     distractor: float = 0.0
     """Value that distractors are fixed to."""
@@ -75,7 +75,7 @@ class Evaluate(Table):
     def _record(self, video: Path) -> None:
         if len(self.runs) != 1:
             raise InputError(f"--video records one run; {len(self.runs)} were given")
-        checkpoint = "best" if self.checkpoint == "best" else "last"
+        checkpoint = "last" if self.checkpoint == "both" else self.checkpoint
         how: dict[str, Any] = {"checkpoint": checkpoint, "target": next(iter(self.target), None)}
         episode_return = record_episode(self.runs[0], video, **how, **self._options())
         print(f"{video}: an episode of return {episode_return:.1f}\n")

@@ -14,7 +14,7 @@ class Export(Table):
     """Run folder."""
     out: Annotated[Path, "FOLDER"]
     """Folder of model.onnx and model.json."""
-    checkpoint: Literal["last", "best"] = "last"
+    checkpoint: Literal["last", "best", "return"] = "last"
     """Weights to export."""
 
     def execute(self) -> None:

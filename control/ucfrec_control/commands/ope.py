@@ -20,7 +20,7 @@ class Ope(Table):
     """Target return (default: the preset's, else the largest of the training)"""
     discount: float = 0.99
     """γ, of later rewards."""
-    checkpoint: Literal["last", "best"] = "last"
+    checkpoint: Literal["last", "best", "return"] = "last"
     """Weights to evaluate."""
 
     def execute(self) -> None:

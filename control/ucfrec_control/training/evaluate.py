@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import rollout
+from ucfrec.acting.rollout import Episodes, rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash, provenance
@@ -35,6 +35,8 @@ from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
+RETURN = "return"
+"""Checkpoint of `ucfrec_control.training.selection`."""
 NO_TARGET = "no target return"
 _SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
 EVALUATE = "evaluate"
@@ -64,7 +66,7 @@ def evaluate_run(
         targets: target returns, None for the largest that the policy expects in each state; empty
             for those of the preset, else the run's own, or the largest expected if the policy was
             trained to know it.
-        checkpoints: "last", "best" or both.
+        checkpoints: of "last", "best" and, where the training selected by return, "return".
         distractor: value that every distractor is fixed to (Appendix G.4: 0).
         reference: returns with scores 0 and 100; None for D4RL's of the task, if there are any.
 
@@ -180,6 +182,23 @@ def rules_of(
     return [DecisionRule(target) for target in targets or default] or [trained.rule]
 
 
+def play(
+    trained: Trained,
+    env_id: str,
+    rule: DecisionRule | None,
+    episodes: int,
+    seed: int,
+    distractor: float = 0.0,
+) -> Episodes:
+    """Roll out `episodes` episodes; arguments and errors as of `open_environment`."""
+    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
+    try:
+        actor = trained.actor(env.num_envs, rule)
+        return rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+    finally:
+        env.close()
+
+
 def _row(
     trained: Trained,
     env_id: str,
@@ -193,12 +212,7 @@ def _row(
     task = find_task(env_id, dataset["dataset"])
     scale = reference or ((task.low, task.high) if task else None)
     began = time.perf_counter()
-    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
-    try:
-        actor = trained.actor(env.num_envs, rule)
-        rolled_out = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
-    finally:
-        env.close()
+    rolled_out = play(trained, env_id, rule, episodes, seed, distractor)
     seconds = time.perf_counter() - began
     returns = rolled_out.returns
     scores = None if scale is None else normalise(returns, scale)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.registry import BUILT_IN, policy_names
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
@@ -101,6 +102,7 @@ def train_control(
     *,
     screening: str | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """`ucfrec.runs.screened.train_screened` on a control store; `screening` is its `how`.
 
@@ -109,4 +111,6 @@ def train_control(
     """
     dataset_of(store)
     entries = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, entries, shared, screen=screen_store)
+    return train_screened(
+        store, out, config, screening, entries, shared, callbacks, screen=screen_store
+    )

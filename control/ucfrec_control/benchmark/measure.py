@@ -9,11 +9,10 @@ from ucfrec.benchmark.cells import Cell, Measurement, open_store, training_confi
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
-from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.methods import PAPER_UCF
 from ucfrec_control.benchmark.robustness import verdicts
 from ucfrec_control.data.distractor import CLEAN
-from ucfrec_control.training.evaluate import evaluate_run, held_out_losses
+from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,
@@ -100,9 +99,7 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     # All evaluations have the same initial states, with and without distractor.
     values = (0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0)
     evaluations = [evaluate(cell, checkpoints=("last",), distractor=v)[0] for v in values]
-    losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
-    more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **losses}
-    more |= describe_updates(cell)
+    more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **describe_updates(cell)}
     if record.screening is not None:
         more[SCREENING] = verdicts(record.screening.dimensions, store)
     return [evaluations[0].of(row_key).extended(more)]

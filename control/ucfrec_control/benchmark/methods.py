@@ -68,7 +68,6 @@ WITHOUT_TIME = (
 WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
 """Methods with embeddings of time steps of which there is one without."""
 
-_FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 METHODS_WO_TIME = {"dt": "dt-wo-time", "dc": "dc-wo-time", "lsdt": "lsdt-wo-time", "ucf": "ucf"}
 """The method without embeddings of time steps, by policy."""
 _PURSUITS = {
@@ -127,20 +126,6 @@ _TABLES: dict[str, Methods] = {
         "ucf-wide": make_augmented_ucf("csg.band=[0.2, 2.0]"),
         "ucf-wo-lower": make_augmented_ucf("csg.band=[0.0, 0.5]"),
         **_paper_rows({"wo-band": ("csg.lambda_band=0.0",), "wo-lower": ("csg.band=[0.0, 0.5]",)}),
-    },
-    # Does augmentation help? Each generator and variant of the copies, with and without gate.
-    "augmentation": {
-        "ucf-wo-count": Method("ucf"),
-        **{
-            f"{name}{variant}{gate}": make_augmented_ucf(*kind, *copies, *gate_settings)
-            for name, kind, gates in (
-                ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
-                ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
-                ("noise", (_NOISE,), (("-wo-gate", (_NO_GATE,)),)),
-            )
-            for variant, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
-            for gate, gate_settings in gates
-        },
     },
 }
 LONGER = {

@@ -121,7 +121,7 @@ class Reproduce(ControlGridOptions):
             else:
                 print_scores(rows, part.table)
             if part.of_runs:
-                runs = [cell.run for cell in cells if cell.run is not None]
+                runs = [c.run for c in cells if c.run is not None and c.training_seed == 0]
                 files, _ = make_figures(runs, [], pictures)
             else:
                 files = make_row_figures(rows, pictures)

@@ -7,18 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Episodes, rollout
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
-from ucfrec.runs.screened import drop_columns
-from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
@@ -254,33 +250,3 @@ def _row(
         "warnings": mismatches(dataset, env_id) or None,
     }
     return row.extended(metrics)
-
-
-_BATCHES, _BATCH = 8, 512
-
-
-@torch.no_grad()
-def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, float]:
-    """Mean action loss at 4,096 steps of validation episodes.
-
-    Unlike scores, the losses do not vary with the course of the rollout.
-
-    Returns:
-        `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
-    """
-    dropped = trained.record.dropped_observations
-    _, validation = training_views(drop_columns(store, dropped))
-    generator = np.random.default_rng(0)
-    sources = trained.record.data.others.get("distractors", [])
-    distractors = [distractor["dimension"] for distractor in sources]
-    dimensions = [d - sum(lower < d for lower in dropped) for d in distractors if d not in dropped]
-    losses = []
-    for _ in range(_BATCHES):
-        episodes, steps = validation.draw_steps(generator, _BATCH)
-        windows = validation.windows(episodes, steps, trained.policy.config.context)
-        fixed = windows.states.clone()
-        fixed[..., dimensions] = 0.0
-        both = (windows, replace(windows, states=fixed))
-        losses.append([float(trained.policy.action_loss(batch)) for batch in both])
-    loss, at_zero = np.mean(losses, axis=0)
-    return {"loss": float(loss), "loss_at_zero": float(at_zero)}

@@ -61,7 +61,7 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
             for own in [{"training_seed": seed, "conditions": conditions}]
         ]
         made = {file.name for file in make_row_figures(rows, tmp_path)}
-        wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
+        wanted = "robustness-small-d.png" if robust else f"scores-small-{part.table}.png"
         assert wanted in made
     assert {*tmp_path.glob("lambda-*.png")} == {
         tmp_path / f"lambda-small{family}.png" for family in ("", "-ucf-paper")

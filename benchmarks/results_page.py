@@ -539,7 +539,7 @@ SECTIONS = (
         "Control at equal training time",
         "The same files, rates and batches, but more steps for the faster methods (x2, x3, x8). "
         "UCF x2 and cloning x8 train about as long as DT and DC, UCF x3 as long as LSDT, half "
-        "as long again. The paper's UCF has 4,000 steps here too. `best-25` learns from the best "
+        "as long again. `ucf-paper` has 4,000 steps here too. `best-25` learns from the best "
         "quarter of the trajectories. UCF without augmentation is ahead of DT, DC and LSDT on all "
         "trajectories, and level with cloning the best quarter.",
         f"`{CONTROL} equal-time`",
@@ -588,11 +588,15 @@ SECTIONS = (
 
 
 NAMES = (
-    ("ucf", "UCF with augmented states, as in the paper; by default `train` augments nothing"),
+    ("ucf", "UCF with augmented states; by default `train` augments nothing"),
     ("ucf-wo-count", "UCF without augmentation, the default of `train`"),
     ("ucf-wo-arch", "DT on the augmented data of UCF"),
     ("ucf-plain", "UCF without the shared components"),
-    ("ucf-paper", "the paper's settings; `-algorithm-5` edits states as its Algorithm 5 says"),
+    (
+        "ucf-paper",
+        "the paper's losses and generator, at the budget's width, batch and rate; `-algorithm-5` "
+        "edits states as its Algorithm 5 says",
+    ),
     ("ucf-screened, -dropped", "interventions on the columns that screening flags; without them"),
     ("-wo-exposure, -wo-rule", "without exposure features; without a selected rule"),
     ("-actions, -both", "augmented actions; augmented states and actions"),

@@ -44,7 +44,7 @@ class Method:
 
 
 def make_augmented_ucf(*settings: str, vectors: bool = True) -> Method:
-    """UCF with augmented states, as in the paper's tables, and more settings."""
+    """UCF with augmented states, and more settings."""
     return Method("ucf", ("augment.copies=1", *settings), vectors=vectors)
 
 

@@ -78,7 +78,7 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, see `_write_graph`) and `model.json`.
+    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
@@ -99,8 +99,8 @@ def export(
     with atomic_folder(out) as scratch:
         path, difference = scratch / GRAPH, 0.0
         sizes = {"inputs": tuple(shapes)}
-        _write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
-        runner = _start_runner(path)
+        write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
+        runner = start_runner(path)
         for sessions in (_COMPARED, 1):
             arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
             results = _run_graph(runner, arguments)
@@ -203,8 +203,8 @@ class ScoreGraph:
         example = {**_name_inputs(session), _EXCLUDED: excluded}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / GRAPH
-            _write_graph(network, example, path, ["scores"], kind, _TORCH)
-            self._runner = _start_runner(path, threads=1)
+            write_graph(network, example, path, ["scores"], kind, _TORCH)
+            self._runner = start_runner(path, threads=1)
         size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = draw_example(seed=number)
@@ -258,7 +258,7 @@ def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
     return {name: v for name, v in zip(_STATE, values, strict=True) if v is not None}
 
 
-def _start_runner(path: Path, threads: int = 0) -> Any:
+def start_runner(path: Path, threads: int = 0) -> Any:
     """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
     import onnxruntime
 
@@ -315,7 +315,7 @@ def _require_installed() -> None:
         ) from None
 
 
-def _write_graph(
+def write_graph(
     module: nn.Module,
     inputs: dict[str, Tensor],
     path: Path,

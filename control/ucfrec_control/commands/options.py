@@ -87,7 +87,7 @@ class ControlGridOptions(GridOptions):
     """Steps of history of a method; repeatable (default: the budget's)"""
     budget: Literal["small", "medium", "full"] = "small"
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
-    times the windows; about 20 core hours for the main table), full (the steps, seeds and episodes
+    times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
     of the papers)"""
     seeds: Annotated[int | None, "N"] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""

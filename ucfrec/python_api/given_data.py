@@ -25,7 +25,7 @@ from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import histories_of_frame, select_users
-from ucfrec.runs.later_logs import later_logs
+from ucfrec.runs.later_logs import columns_used, later_logs, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, shown
 
@@ -124,7 +124,7 @@ def prepare_store(
         adapter: Dataset = load_plugin("datasets", dataset)
         files, columns = adapter.resolve(_list_paths(data), columns)
     else:
-        frame = _write_frame(data, scratch)
+        frame = _write_frame(data, scratch, columns, options.get("reward"))
         files = (frame,)
     with use_words_of_python(frame):
         how = PrepareOptions(**{**options, "dataset": dataset})
@@ -197,7 +197,8 @@ def open_files(
         yield *later_logs(trained, _list_paths(logs), columns), None
     else:
         with scratch_folder(Path(gettempdir()), "frame") as scratch:
-            file = _write_frame(logs, scratch)
+            used = columns_used(trained, columns)
+            file = _write_frame(logs, scratch, used, reward_of(trained))
             yield (file,), columns, file
 
 
@@ -230,9 +231,9 @@ def read_histories(
     return histories if ids is None else select_users(histories, ids)
 
 
-def _write_frame(frame: Any, scratch: Path) -> Path:
+def _write_frame(frame: Any, scratch: Path, columns: LogMapping, reward: str | None) -> Path:
     file = scratch / _FRAME
-    pq.write_table(log_table(frame, "data"), file)
+    pq.write_table(log_table(frame, "data", columns, reward), file)
     return file
 
 

@@ -65,7 +65,7 @@ class LikedExpression:
         source = Path(_ROWS)
         types = tuple((name, "DOUBLE") for name in self._names.values())
         table = FrameTable((source,), types)
-        with engine((), None) as connection, explain_errors(connection, (table,), source):
+        with engine((), None) as connection, explain_errors(connection, (table,)):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
             sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":

@@ -299,6 +299,11 @@ def table_name(file: Path) -> str:
 def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
     """The tables at a path, those of a folder and its sub-folders by name; `parents` are the
     folders that it lies in, without links, for a link may lead back to one of them."""
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"{path} is a link to a file that does not exist; fetch that file, e.g. with git annex "
+            "get or dvc pull, or remove the link"
+        )
     if not path.is_dir():
         if path.name.lower().endswith(_OTHER_TABLES):
             warn_user(f"{path} is not read; {_CONVERT}")

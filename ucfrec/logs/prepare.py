@@ -24,6 +24,7 @@ from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
+    count_features,
     encode_ids,
     feature_digest,
     load_features,
@@ -32,6 +33,7 @@ from ucfrec.logs.features import (
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
+from ucfrec.logs.tables import first_and_more
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
@@ -229,7 +231,7 @@ def read_log(
         with progress(4, "check the logs", "stages") as stage:
             opened = open_log_tables(connection, files, mapping, reward, session_by)
             mapping, reward = opened.mapping, opened.reward
-            with explain_errors(connection, opened.tables, spill):
+            with explain_errors(connection, opened.tables):
                 if options.engine == "spark":
                     from ucfrec.logs.spark import sort_with_spark  # an extra
 
@@ -237,7 +239,7 @@ def read_log(
                         opened, known_items, scratch, options.duplicates, options.spark_master
                     )
                 else:
-                    log = open_log(opened, spill, sessions.list_text_ids(store))
+                    log = open_log(opened, sessions.list_text_ids(store))
                     by_session = log.session_by == schema.SESSION_ID
                     rows = sort_rows(
                         log, known_items, options.duplicates, scratch, by_session, held
@@ -279,6 +281,13 @@ def read_log(
                     "min_steps": options.min_steps,
                     "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
+                    "feature_tables": {
+                        name: {
+                            first_and_more([*map(Path, t.files)]): count_features(connection, rows)
+                            for t, rows in zip(tables_of_ids[name], names, strict=True)
+                        }
+                        for name, names in features.items()
+                    },
                 }
                 stage.update()
         yield PreparedLog(rows, cut, features, report, scratch)

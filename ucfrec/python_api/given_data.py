@@ -26,7 +26,7 @@ from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import histories_of_frame, select_users
-from ucfrec.runs.later_logs import later_logs
+from ucfrec.runs.later_logs import columns_used, later_logs, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, shown
 
@@ -121,7 +121,9 @@ def prepare_store(
     if "dataset" in options and not _are_paths(data):
         raise InputError(f"dataset is {dataset!r}, but only files have one; leave it out")
     adapter: Dataset = load_plugin("datasets", dataset)
-    files, columns, frame = _find_files(data, columns, adapter.resolve, scratch)
+    files, columns, frame = _find_files(
+        data, columns, adapter.resolve, scratch, columns, options.get("reward")
+    )
     dataset = data.dataset if isinstance(data, LogFiles) else dataset
     with use_words_of_python(frame):
         how = PrepareOptions(**{**options, "dataset": dataset})
@@ -187,8 +189,10 @@ def open_files(
     Raises:
         InputError: a path is missing, or the frame cannot be used.
     """
+    columns = _read_columns(mapping)
+    how = columns_used(trained, columns), reward_of(trained)
     with scratch_folder(Path(gettempdir()), "frame") as scratch:
-        yield _find_files(logs, _read_columns(mapping), partial(later_logs, trained), scratch)
+        yield _find_files(logs, columns, partial(later_logs, trained), scratch, *how)
 
 
 def read_histories(
@@ -225,15 +229,18 @@ def _find_files(
     columns: LogMapping,
     resolve: Callable[[Sequence[str | Path], LogMapping], Resolved],
     scratch: Path,
+    used: LogMapping,
+    reward: str | None,
 ) -> tuple[tuple[Path, ...], LogMapping, Path | None]:
-    """Files of logs, their mapping, and the file in `scratch` to which a frame is written."""
+    """Files of logs, their mapping, and the file in `scratch` to which a frame is written: the
+    columns that are `used`, or that the `reward` reads."""
     if isinstance(logs, LogFiles):
         return logs.files, columns.over(logs.mapping), None
     if _are_paths(logs):
         paths = [logs] if isinstance(logs, (str, Path)) else list(logs)
         return *resolve(paths, columns), None
     file = scratch / _FRAME
-    pq.write_table(log_table(logs, "data"), file)
+    pq.write_table(log_table(logs, "data", used, reward), file)
     return (file,), columns, file
 
 

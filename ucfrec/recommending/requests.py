@@ -245,7 +245,7 @@ class RowRewards:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
             try:
-                with explain_errors(connection, (table,), source):
+                with explain_errors(connection, (table,)):
                     sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
                     query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
                     values = [row[0] for row in connection.sql(query).fetchall()]

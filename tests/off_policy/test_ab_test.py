@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import chisquare
 
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
@@ -28,6 +29,7 @@ def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFr
 def test_a_planted_difference_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log(4000, 0.4).to_parquet(tmp_path / "log.parquet")
     arguments = ["compare", str(tmp_path / "log.parquet"), "--expected", "0.05"]
+    arguments += ["--shares", "a=0.8,b=0.2"]
     assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["arms"] == ["a", "b"]
@@ -163,3 +165,22 @@ def test_looking_every_day_finds_a_difference_that_is_not_there_in_few_tests() -
         wrong["planned"] |= np.abs(difference) > 1.96 * np.sqrt(variance)
     assert wrong["always"].mean() <= 0.05
     assert wrong["planned"].mean() > 0.2
+
+
+def test_arms_that_lack_users_conclude_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "log.parquet"
+    log(5000, 0.4).to_parquet(file)
+    as_drawn = compare_arms([file], shares={"a": 0.4, "b": 0.1, "c": 0.5})
+    expected = chisquare(as_drawn.in_arm, [4000, 1000]).pvalue
+    assert as_drawn.split_p_value == pytest.approx(expected)
+    assert not as_drawn.is_mismatched
+    even = compare_arms([file])
+    assert even.split_p_value == pytest.approx(chisquare(even.in_arm).pvalue)
+    assert "80.0% and 20.0%, where 50.0% and 50.0% were intended (p = 0)" in str(even)
+    assert even.conclusion.startswith("nothing can be concluded")
+    for users, is_mismatched in ((120, False), (145, False), (160, True)):
+        few = replace(even, in_arm=(users, 100))
+        assert few.split_p_value == pytest.approx(chisquare(few.in_arm).pvalue)
+        assert few.is_mismatched is is_mismatched
+    with pytest.raises(InputError, match="shares are given of a, c; the arms are"):
+        compare_arms([file], shares={"a": 0.5, "c": 0.5})

@@ -130,6 +130,8 @@ class Compare(Table):
     expected: Annotated[float | None, "DIFFERENCE"] = None
     """Difference per shown item for which the always-valid interval is shortest; fix it before the
     test (default: 5% of the value of A)"""
+    shares: Annotated[str | None, "A=SHARE,B=SHARE"] = None
+    """Shares of the users that were intended for the arms, as of serve --split (default: equal)"""
     json: Annotated[Path | None, "FILE"] = None
     """Also write the numbers as JSON."""
     memory_limit: Annotated[str, "SIZE"] = "2GB"
@@ -141,11 +143,15 @@ class Compare(Table):
 
         from ucfrec.files.atomic import write_json
         from ucfrec.off_policy.ab_test import compare_arms
+        from ucfrec.recommending.responder import parse_split
 
         arms = None if self.arms is None else [arm.strip() for arm in self.arms.split(",")]
         if self.expected is not None and not self.expected > 0:
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
-        result = compare_arms(self.logs, self.column, arms, self.expected, self.memory_limit)
+        shares = None if self.shares is None else parse_split(self.shares)
+        result = compare_arms(
+            self.logs, self.column, arms, self.expected, shares, self.memory_limit
+        )
         print(f"{result}\n\n{result.conclusion}")
         if self.json is not None:
             write_json(self.json, asdict(result))

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
@@ -24,6 +24,8 @@ _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
+MISMATCH: Final = 0.001
+"""Below this p-value, the users were not drawn into the arms by the intended shares."""
 _LARGEST: Final = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""
 
@@ -36,6 +38,11 @@ class Comparison:
     arms: tuple[str, str]
     values: tuple[float, float]
     users: tuple[int, int]
+    """Users with a value."""
+    in_arm: tuple[int, int]
+    """All users of the arms."""
+    shares: tuple[float, float]
+    """Intended shares of the arms among the users of both."""
     rows: tuple[int, int]
     """Rows with a value, which count; what follows is left out."""
     without_value: tuple[int, int]
@@ -70,6 +77,13 @@ class Comparison:
             "users were in more than one arm; their rows are left out": self.in_several,
         }
         lines += [f"{count:,} {text}" for text, count in left_out.items() if count]
+        if self.is_mismatched:
+            (a, b), (first, second) = self.in_arm, self.shares
+            lines.append(
+                f"sample ratio mismatch: {a:,} and {b:,} users, {a / (a + b):.1%} and "
+                f"{b / (a + b):.1%}, where {first:.1%} and {second:.1%} were intended (p = "
+                f"{self.split_p_value:.2g})"
+            )
         low, high, always_low, always_high = (
             "unknown" if end is None else f"{end:+.4g}"
             for end in (self.low, self.high, self.always_low, self.always_high)
@@ -81,9 +95,27 @@ class Comparison:
         return "\n".join(lines)
 
     @property
+    def split_p_value(self) -> float:
+        """Of the χ² test that users were drawn into the arms by the intended shares."""
+        expected = sum(self.in_arm) * self.shares[0]
+        off = (self.in_arm[0] - expected) ** 2 / (expected * self.shares[1])
+        return math.erfc(math.sqrt(off / 2))
+
+    @property
+    def is_mismatched(self) -> bool:
+        """Whether the arms have other shares of the users than intended: a sample ratio mismatch
+        (Fabijan et al., KDD 2019), after which a difference may be one of the users."""
+        return self.split_p_value < MISMATCH
+
+    @property
     def conclusion(self) -> str:
-        """What the always-valid interval says."""
+        """What the split of the users and the always-valid interval say."""
         first, second = self.arms
+        if self.is_mismatched:
+            return (
+                "nothing can be concluded: users are missing from an arm, or were drawn otherwise; "
+                f"if other shares were intended, name them: --shares {first}=0.9,{second}=0.1"
+            )
         if self.always_low is None or self.always_high is None:
             return (
                 f"nothing can be said yet: an arm has fewer than {FEWEST_USERS} users with a "
@@ -115,12 +147,14 @@ def compare_arms(
     column: str = FEEDBACK,
     arms: Sequence[str] | None = None,
     expected: float | None = None,
+    shares: Mapping[str, float] | None = None,
     memory_limit: str = "2GB",
 ) -> Comparison:
     """Compare two arms, or the two that there are, most users first, in logs of `ucfrec join`.
     Users are drawn into arms, so they are clusters. Rows without a value are left out, with an
     `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
-    beforehand; None for 5% of the first arm's value.
+    beforehand; None for 5% of the first arm's value. `shares` of the users were intended for the
+    arms, by name; None for equal ones.
 
     Raises:
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
@@ -137,12 +171,12 @@ def compare_arms(
         )
     counts = has_user & has_arm & (groups["arms"] == 1)
     sums: dict[str, Float64Array] = {}
-    without_value: dict[str, int] = {}
+    without_value, in_arm = dict[str, int](), dict[str, int]()
     for arm in map(str, np.unique(groups[schema.ARM][counts])):
         inside = counts & (groups[schema.ARM] == arm)
         values, with_value, rows = (groups[part][inside] for part in ("value", "shown", "rows"))
         sums[arm] = np.stack([values, with_value.astype(np.float64)])[:, with_value > 0]
-        without_value[arm] = int((rows - with_value).sum())
+        without_value[arm], in_arm[arm] = int((rows - with_value).sum()), len(rows)
     users = {arm: values.shape[1] for arm, values in sums.items()}
     names = arms or sorted(users, key=lambda arm: -users[arm])
     if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
@@ -153,6 +187,9 @@ def compare_arms(
             "--arms A,B"
         )
     first, second = names
+    if shares is not None and not {first, second} <= shares.keys():
+        raise InputError(f"{name}: shares are given of {', '.join(shares)}; the arms are {names}")
+    of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
     if without_value[first] or without_value[second]:
         text = (
             f"{name}: {column} has no value in {without_value[first]:,} rows of {first} and "
@@ -174,6 +211,8 @@ def compare_arms(
         arms=(first, second),
         values=(value_a, value_b),
         users=(users[first], users[second]),
+        in_arm=(in_arm[first], in_arm[second]),
+        shares=(of_first / (of_first + of_second), of_second / (of_first + of_second)),
         rows=(int(sums[first][1].sum()), int(sums[second][1].sum())),
         without_value=(without_value[first], without_value[second]),
         without_user=int(groups["rows"][~has_user].sum()),

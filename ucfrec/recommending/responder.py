@@ -245,9 +245,9 @@ def parse_split(text: str) -> dict[str, float]:
         try:
             shares[name.strip()] = float(share)
         except ValueError:
-            raise InputError(f"--split {text}: write RUN=SHARE,RUN=SHARE") from None
+            raise InputError(f"{text} are no shares of arms: write RUN=SHARE,RUN=SHARE") from None
     if not all(0 < share <= 1 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
-        raise InputError(f"--split {text}: shares are above 0 and add up to 1")
+        raise InputError(f"{text}: shares are above 0 and add up to 1")
     return shares
 
 

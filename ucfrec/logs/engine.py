@@ -63,7 +63,9 @@ def engine(
     """
     with scratch_folder(folder, "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
-        database = str(work / "rows.duckdb") if work else ":memory:"
+        # In the name of a database, DuckDB reads "?" and "\\" as those of an address.
+        usual = work is not None and not {*"?\\"} & {*str(work.absolute())}
+        database = f"{work}/rows.duckdb" if usual else ":memory:"
         connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:

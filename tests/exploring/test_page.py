@@ -109,7 +109,7 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
         ({"user": "7", "k": "0"}, "k is &#39;0&#39;; give a number from 1 to 100"),
         ({"user": "7", "custom": "on", "temperature": "x"}, "temperature is"),
         ({"user": "7", "custom": "on", "temperature": "-1"}, "temperature is -1"),
-        ({"history": "99, 1"}, "does not know the items 99; take their lines out of the history"),
+        ({"history": "99, 1"}, "item_id that the policy does not know (1 item"),
         ({"history": "3, much"}, "line 1 of the history"),
     ],
 )

@@ -420,3 +420,12 @@ def test_errors_of_frames_name_the_frame(frame: pd.DataFrame, said: str) -> None
         assert ".parquet" not in text
         assert "--" not in text
     assert said in str(error.value)
+
+
+def test_a_tilde_is_no_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = Path("~x.parquet")
+    pq.write_table(pa.table({"a": [1]}), file)
+    with engine([file], Path("~y")) as connection:
+        (table,) = open_tables(connection, [file])
+        assert connection.sql(f"SELECT a FROM {table.sql}").fetchall() == [(1,)]

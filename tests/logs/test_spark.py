@@ -58,7 +58,9 @@ def test_stores_are_the_same(tmp_path: Path, spark: Any, text: bool, session_by:
     )
 
 
-def test_stores_of_vectors_are_the_same(tmp_path: Path, spark: Any) -> None:
+def test_stores_of_vectors_are_the_same_in_a_folder_of_any_name(tmp_path: Path, spark: Any) -> None:
+    tmp_path = tmp_path / "a %2F[1]{b}?"
+    tmp_path.mkdir()
     log = make_log(300, text=False, seed=1)
     generator = np.random.default_rng(0)
     log["action"] = list(generator.integers(2, size=(300, 2)).astype("f4"))

@@ -1,7 +1,7 @@
 """The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
-import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
@@ -20,7 +20,6 @@ from ucfrec.exploring.explain import PARTS, explain, read_pasted
 from ucfrec.files.record import CARD
 from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
-from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import render_report, template
 from ucfrec.reporting.results import find_quoted, read_evidence
@@ -29,7 +28,6 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 _PACKAGE: Final = "ucfrec.exploring"
 _TITLES: Final = ("title", "name")
 _IMAGES: Final = ("image", "image_url", "picture")
-_NUMBER: Final = re.compile(r"-?\d{1,12}(\.\d{1,12})?")
 _USERS_LISTED: Final = 1000
 _MOST_ITEMS: Final = 100
 _HEADERS: Final = {
@@ -153,10 +151,11 @@ class Explorer:
             sliders.append(("tag_window", "Exclude tags of the last items", 0, 10, 1))
         shown = []
         for name, label, low, high, step in sliders:
-            value, text = getattr(trained.rule, name), fields.get(name, "")
+            value = getattr(trained.rule, name)
             # Where a number is wrong, the list says so.
-            if fields.get("custom") is not None and _NUMBER.fullmatch(text):
-                value = float(text)
+            if "custom" in fields and fields.get(name):
+                with suppress(InputError):
+                    value = _read_number(fields, name, low, high)
             slider = {"name": name, "label": label, "low": low, "high": high, "step": step}
             shown.append({**slider, "value": highest if value is None else value})
         return shown
@@ -177,18 +176,9 @@ class Explorer:
 
 def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
     """The history that is pasted, else that of the user in the store."""
-    run, text = trained.folder.name, fields.get("history", "").strip()
-    if text:
-        (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
-        unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
-        if len(unknown):
-            names = name_some(list(dict.fromkeys(unknown.tolist())))
-            raise InputError(
-                f"the run {run} does not know the items {names:.200}; take their lines out of the "
-                "history"
-            )
-        return history
-    user = fields.get("user", "").strip()
+    if text := fields.get("history", "").strip():
+        return next(read_histories(trained, read_pasted(text), None, ["pasted"]))
+    run, user = trained.folder.name, fields.get("user", "").strip()
     if trained.users.numbers(np.asarray([user]))[0] < 0:
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
@@ -198,8 +188,7 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"
         )
-    (history,) = read_histories(trained, None, None, [user])
-    return history
+    return next(read_histories(trained, None, None, [user]))
 
 
 def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:

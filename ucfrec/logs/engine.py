@@ -72,9 +72,11 @@ def engine(
     Beyond `memory_limit`, such as "2GB", of the engine or with `shared` of the process, whose rest
     may take half of it, rows spill to disk. Raises InputError if it is not a size.
     """
-    with scratch_folder(folder, "rows") if folder else nullcontext() as work:
+    with scratch_folder(folder.absolute(), "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
-        database = str(work / "rows.duckdb") if work else ":memory:"
+        # In the name of a database, DuckDB reads "?" and "\\" as those of an address.
+        usual = work is not None and not {*"?\\"} & {*str(work)}
+        database = f"{work}/rows.duckdb" if usual else ":memory:"
         connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:

@@ -174,9 +174,10 @@ def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
 def _save(spark: Any, frame: Any, folder: Path) -> Any:
     """Write a frame to Parquet files; returns it as read from them."""
     # Each is used several times, and Spark would compute it again each time.
-    address = folder.absolute().as_uri()
+    # Of an address, Spark decodes no character; what it reads is a pattern.
+    address = f"file://{folder.absolute()}"
     frame.write.parquet(address)
-    return spark.read.parquet(address)
+    return spark.read.parquet(re.sub(r"([\\*?{}\[\]])", r"\\\1", address))
 
 
 def _list_parts(folder: Path) -> list[Path]:

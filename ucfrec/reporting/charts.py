@@ -175,24 +175,20 @@ def interval_chart(title: str, intervals: Sequence[Interval], logged: float | No
     """
     from matplotlib.figure import Figure
 
-    names = [textwrap.wrap(one_line(row.name), _NAME_CHARACTERS) or [""] for row in intervals]
-    tops = np.cumsum([0, *(_NAME * len(lines) + _BAR for lines in names)])
-    height = max(int(tops[-1]), 1) + _BOTTOM
-    figure = Figure(figsize=(WIDTH / 72, height / 72))
-    figure.set_layout_engine("none")
-    axes = figure.add_axes((0.04, _BOTTOM / height, 0.92, 1 - _BOTTOM / height))
-    axes.set_ylim(height - _BOTTOM, 0)
-    axes.set_yticks([])
-    axes.spines[["left"]].set_visible(any(interval.reliable is None for interval in intervals))
-    axes.spines[["left"]].set_position(("data", 0))
+    names = [textwrap.fill(one_line(interval.name), _NAME_CHARACTERS) for interval in intervals]
+    slot = _NAME * max((name.count("\n") + 1 for name in names), default=1) + _BAR
+    count, bars = max(len(names), 1), any(interval.reliable is None for interval in intervals)
+    figure = Figure(figsize=(WIDTH / 72, (slot * count + _BOTTOM) / 72))
+    axes = figure.add_subplot(ylim=(count, 0), yticks=[])
+    axes.spines["left"].set(visible=bars, position=("data", 0))
     axes.grid(axis="x")
-    for top, lines, interval in zip(tops, names, intervals, strict=False):
-        middle = top + _NAME * len(lines) + 9
-        dashes = "dashed" if interval.reliable is False else "solid"
-        place = axes.get_yaxis_transform()
-        axes.text(0.01, top + 2, "\n".join(lines), transform=place, va="top", size=12)
-        if interval.reliable is None:
-            axes.barh(middle, interval.value, height=16, color=SERIES[0], alpha=0.55)
+    place = axes.get_yaxis_transform()
+    for top, (name, interval) in enumerate(zip(names, intervals, strict=True)):
+        middle, dashes = top + 1 - 19 / slot, "dashed" if interval.reliable is False else "solid"
+        above = middle - 10 / slot
+        axes.text(0.01, above, name, transform=place, va="bottom", size=12, in_layout=False)
+        if bars:
+            axes.barh(middle, interval.value, 16 / slot, color=SERIES[0], alpha=0.55)
         else:
             fill = SERIES[0] if interval.reliable else PAPER
             axes.plot(interval.value, middle, "o", color=SERIES[0], markerfacecolor=fill, zorder=3)

@@ -17,7 +17,7 @@ from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.provenance import config_hash, shorten_paths
-from ucfrec.reporting.tables import Table, format_value, markdown_table
+from ucfrec.reporting.tables import Table, markdown_table
 from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
@@ -189,12 +189,9 @@ def _describe_rule(run: Path, record: RunRecord) -> str:
             f"Its decision rule: {read_rule(run / RULE)}. `evaluate`, `ope`, `rank` and "
             "`recommend` act by it unless another is named; each measurement below names its own."
         )
-    numbers = tabulate_user_model(record)
-    if numbers is None:
+    if not (numbers := describe_user_model(record)):
         return f"{text}\n\nIt was chosen without a user model."
-    rows = [[name, *values] for name, values in numbers.rows]
-    table = markdown_table(["part", "value"], rows)
-    return f"{text}\n\nThe user model, which chose the rule:\n\n{table}"
+    return f"{text}\n\nThe user model, which chose the rule:\n\n{_tabulate(numbers)}"
 
 
 def _list_limits(run: Path, record: RunRecord, refitted: bool) -> list[str]:
@@ -249,15 +246,16 @@ def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _tabulate(rows: Mapping[str, object]) -> str:
-    body = [[name, format_value(value)] for name, value in rows.items() if value is not None]
-    return markdown_table(["what", "value"], body)
+    present = {name: value for name, value in rows.items() if value is not None}
+    body = Table.of_columns("", {"value": present}).rows
+    return markdown_table(["what", "value"], [(name, *cells) for name, cells in body])
 
 
-def tabulate_user_model(record: RunRecord) -> Table | None:
-    """The held-out loss of every part of the user model beside simpler parts; None without one."""
+def describe_user_model(record: RunRecord) -> dict[str, object]:
+    """The held-out loss of every part of the user model beside simpler parts; empty without one."""
     reward, rule = record.reward_model, record.rule
     if reward is None or rule is None:
-        return None
+        return {}
     rows: dict[str, Any] = {
         "reward: loss of the mean": reward.base_loss,
         "reward: loss of item effects": reward.item_loss,
@@ -278,4 +276,4 @@ def tabulate_user_model(record: RunRecord) -> Table | None:
         rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
-    return Table.of_columns("User model, on held-out rows", {"value": rows})
+    return rows

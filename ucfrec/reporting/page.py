@@ -17,7 +17,7 @@ from ucfrec.errors import damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.logs.summary import format_report
-from ucfrec.reporting.model_card import describe_data, tabulate_user_model
+from ucfrec.reporting.model_card import describe_data, describe_user_model
 from ucfrec.reporting.results import (
     conclude,
     draw_environments,
@@ -168,7 +168,8 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         if run.augmentation is not None:
             edited.append((run.name, style, run.augmentation))
         if run.record.sizes["items"]:
-            if (table := tabulate_user_model(run.record)) is not None:
+            if parts := describe_user_model(run.record):
+                table = Table.of_columns("User model, on held-out rows", {"value": parts})
                 user_models.append((run.name, table))
             if (drawn := draw_frontier(run.record, read_candidates(run.folder))) is not None:
                 frontiers.append((run.name, drawn))

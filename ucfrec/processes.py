@@ -130,21 +130,6 @@ def block_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def end_with_parent() -> None:
-    """In a process of `multiprocessing`: end when the parent has ended, also when it was killed."""
-    import multiprocessing  # takes longer than the rest of this module
-
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        parent.join()
-        os._exit(128 + signal.SIGTERM)
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
-
-
 @contextmanager
 def pool_of_processes(
     workers: int, begin: Callable[[], None] | None = None
@@ -171,7 +156,17 @@ def pool_of_processes(
 
 
 def _begin(begin: Callable[[], None] | None) -> None:
-    end_with_parent()
+    """End when the parent has ended, also when it was killed; call `begin`."""
+    import multiprocessing  # takes longer than the rest of this module
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
     if begin is not None:
         begin()
 

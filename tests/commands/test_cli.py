@@ -422,8 +422,8 @@ def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> No
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
     assert all(row["band_low"] < row["band_high"] for row in ranked.values())
     for more, says in (
-        ([run, "--targets", "5,much"], "neither a return nor a quantile"),
-        ([run, "--temperatures", "1,hot"], "are not numbers; write e.g. 0,0.5,1"),
+        ([run, "--targets", "5,much"], "--targets: 'much' is not a number"),
+        ([run, "--temperatures", "1,hot"], "is not a number; write e.g. 0,0.5,1"),
         ([], "name a run folder"),
     ):
         assert says in refused(["ope", *more, str(logs)], capsys)

@@ -48,13 +48,12 @@ def run_program(module: str) -> int:
     Until it is imported, Ctrl-C and TERM end the process with one line and status 130 or 143; once
     it has ended, they change nothing: without this, Python would give the signals back to the
     operating system while it ends, and the process would count as killed. Characters that the
-    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command. A
-    pipe gets each line when it is due.
+    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command.
     """
     _handle_signals(_end)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace", line_buffering=True)
+            stream.reconfigure(errors="replace")
     main: Callable[[], int] = import_module(module).main
     try:
         return main()

@@ -12,7 +12,7 @@ import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib import import_module, metadata
 from typing import Any, Final
 
@@ -110,7 +110,8 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
             name = f"{program.name} {options.command}"
             table = program.find_table(options.command)
             with local_paths(options) as options:
-                table.read(options).execute()
+                values = {field.name: getattr(options, field.name) for field in fields(table)}  # type: ignore[arg-type]
+                table(**values).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():

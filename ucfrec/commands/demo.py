@@ -110,37 +110,22 @@ class Demo(Table):
 def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
     """What the rows of an environment, by method, show, in words."""
     values = {method: _describe_value(row) for method, row in rows.items()}
-    lines = [
+    shared = "there are no shared components, as actions are vectors"
+    if SHARED in rows:
+        shared = (
+            f"with the shared components, which UCF has too and any method can use, DT has\n"
+            f"  {values[SHARED]} (exposure features, reward weight, selected decision rule)"
+        )
+    return (
         f"- {environment}: logged sessions have {values['logging']}, random actions "
         f"{values['random']}, the best\n  possible ones {values['optimal']}. From the log alone, "
-        f"UCF reaches {values['ucf']}."
-    ]
-    if SHARED in rows:
-        lines.append(
-            "  Every method can use the shared components (exposure features, reward weight,\n"
-            f"  selected decision rule). With them, DT has {values[SHARED]}: "
-            f"{_compare(rows[SHARED], rows['dt'], 'DT without them')},\n"
-            f"  {values['dt']}. UCF, which has them too, is "
-            f"{_compare(rows['ucf'], rows[SHARED], 'DT with them')}."
-        )
-    else:
-        lines.append(
-            f"  Actions are vectors, so there are no shared components: UCF is "
-            f"{_compare(rows['ucf'], rows['dt'], 'DT')}, {values['dt']}."
-        )
-    return "\n".join(lines)
+        f"UCF reaches {values['ucf']}, DT {values['dt']};\n  {shared}.\n"
+        "  Where two intervals overlap, the order is open."
+    )
 
 
 def _describe_value(row: "ResultRow") -> str:
     return f"{row.value:.3g} [{row['R_cum_low']:.3g}, {row['R_cum_high']:.3g}]"
-
-
-def _compare(row: "ResultRow", reference: "ResultRow", name: str) -> str:
-    """How a return compares with another one, by 95% intervals that do not overlap."""
-    if row["R_cum_low"] > reference["R_cum_high"]:
-        return f"above {name}"
-    below = row["R_cum_high"] < reference["R_cum_low"]
-    return f"below {name}" if below else f"level with {name} (the intervals overlap)"
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":

@@ -517,6 +517,13 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "run.json"}
 
 
+def test_numbers_out_of_their_range_are_refused(capsys: Capsys) -> None:
+    for number in ("0", "257", "9" * 20, "1.5"):
+        with pytest.raises(SystemExit):
+            main(["serve", "run", "--workers", number])
+        assert f"{number} is not a whole number from 1 to 256" in capsys.readouterr().err
+
+
 def test_errors_are_shown_whole() -> None:
     long = "x" * 999
     assert f"({long})" in str(explanation(MemoryError(long)))

@@ -159,18 +159,12 @@ def test_pipelined_requests_take_no_memory_and_term_is_obeyed(trained: TrainedPo
             assert cpu_seconds(process.pid) - began < 5
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "said"),
-    [
-        *(("allowed-hosts", given, "is not a host") for given in ("a*", "http://a", "", "a:80")),
-        *(("workers", n, f"{n}; give a number from 1 to 256\n") for n in ("0", "10000")),
-    ],
-)
-def test_options_that_say_nothing_are_refused(
-    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str], option: str, value: str, said: str
+@pytest.mark.parametrize("value", ["a*", "http://a", "", "a:80"])
+def test_hosts_that_are_none_are_refused(
+    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str], value: str
 ) -> None:
-    assert main(["serve", str(trained.folder), "--port", "0", f"--{option}", value]) == 2
-    assert said in capfd.readouterr().err
+    assert main(["serve", str(trained.folder), "--port", "0", "--allowed-hosts", value]) == 2
+    assert "is not a host" in capfd.readouterr().err
 
 
 def test_a_damaged_run_and_a_taken_port_are_refused(

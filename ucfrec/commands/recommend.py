@@ -59,7 +59,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             )
         from ucfrec.files.parquet import write_frames
         from ucfrec.recommending.histories import histories_of_files
-        from ucfrec.recommending.recommend import recommend
+        from ucfrec.recommending.recommend import ItemIndex, recommend
 
         trained, index = self.load(self.run), None
         master = self.find_spark()
@@ -93,8 +93,6 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             print(f"{origin(self.out)}: {rows:,} rows")
             return
         if self.approximate:
-            from ucfrec.recommending.recommend import ItemIndex
-
             index = ItemIndex(trained.item_scorer(rule), trained.name)
         with progress(None, "recommend", "users") as bar:
 

@@ -1,11 +1,11 @@
 """`ucfrec ope`: the return of a policy, estimated from logs alone; `score`: what it needs of the
 policy; `rank`: how policies rank what users were shown and clicked later."""
 
+import shlex
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
@@ -308,7 +308,7 @@ class Rank(LogOptions, RuleOptions):
         print(_describe_ranking(ranking))
         if self.json is not None:
             ranking.save(self.json)
-        print(_conclude_ranking(ranking, runs[0]))
+        print(_conclude_ranking(ranking, [str(runs[0]), *map(origin, logs)]))
 
 
 def _describe_ranking(ranking: "Ranking") -> str:
@@ -333,8 +333,9 @@ def _describe_ranking(ranking: "Ranking") -> str:
     return "\n".join([*lines, *(f"warning: {warning}" for warning in ranking.warnings)])
 
 
-def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
-    """What the rows show, in two lines: the best by liked items, and what to do next."""
+def _conclude_ranking(ranking: "Ranking", measured: Sequence[str]) -> str:
+    """What the rows show, in two lines: the best by liked items, and what to do next with the run
+    and the logs that were measured."""
     rows, name = ranking.rows, "hit_rate_liked"
     if name not in rows[0].metrics:
         return "\nno step was liked; next: name what counts as liked with --liked"
@@ -345,5 +346,5 @@ def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
     return (
         f"\n{best.method} has the highest hit rate on liked items ({best.metrics[name]:.3f} with "
         f"{best.conditions['k']} items){first}. Logged clicks favour what was shown:\n"
-        f"next: ucfrec ope {quote(str(run))}, the return per session that it would bring"
+        f"next: ucfrec ope {shlex.join(measured)}, the return per session that it would bring"
     )

@@ -19,9 +19,7 @@ from ucfrec.results.rows import read_results
 TINY = DemoConfig(
     sessions=300,
     episodes=100,
-    settings=("train.steps=20", "crm.epochs=1", "rule.sessions=10"),
-    context=4,
-    dim=16,
+    settings=("policy.dim=16", "train.steps=20", "crm.epochs=1", "rule.sessions=10"),
     methods=tuple(METHODS),
 )
 

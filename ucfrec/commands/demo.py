@@ -17,14 +17,15 @@ if TYPE_CHECKING:
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
+CONTEXT = "policy.context=11"
 PLAIN = ("policy.exposure=false", "rule.choose=false")
 """Settings of a method as its authors describe it: the best item at the largest training return."""
 METHODS: dict[str, tuple[str, ...]] = {
     "bc": ("bc", *PLAIN),
-    "dt": ("dt", *PLAIN),
-    SHARED: ("dt", "policy.exposure=true", "rule.choose=true"),
-    "ucf-no-augmentation": ("ucf",),
-    "ucf": ("ucf", "augment.copies=1"),
+    "dt": ("dt", CONTEXT, *PLAIN),
+    SHARED: ("dt", CONTEXT, "policy.exposure=true", "rule.choose=true"),
+    "ucf-no-augmentation": ("ucf", CONTEXT),
+    "ucf": ("ucf", CONTEXT, "augment.copies=1"),
 }
 """Name in the results to the policy and the settings that it has besides `DemoConfig.settings`."""
 BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}
@@ -44,14 +45,13 @@ class DemoConfig:
     episodes: int = 500
     """Evaluated episodes of each policy."""
     settings: Sequence[str] = (
+        "policy.dim=32",
         "train.steps=300",
         "train.learning_rate=2e-3",
         "crm.epochs=4",
         "rule.sessions=50",
         "rule.evidence=0",
     )
-    context: int = 11
-    dim: int = 32
     methods: Sequence[str] = ("dt", SHARED, "ucf")
     """Names of `METHODS`."""
 
@@ -64,8 +64,7 @@ class DemoConfig:
 FULL = DemoConfig(
     sessions=6000,
     episodes=1000,
-    settings=("train.steps=1500", "train.learning_rate=1e-3", "crm.epochs=8"),
-    dim=64,
+    settings=("policy.dim=64", "train.steps=1500", "train.learning_rate=1e-3", "crm.epochs=8"),
     methods=tuple(METHODS),
 )
 """Sizes at which the methods differ as in the documentation: a quarter of an hour on two cores."""
@@ -194,9 +193,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
 
     torch.set_num_threads(1)
     policy, *settings = METHODS[name]
-    size = [f"policy.dim={config.dim}"]
-    size += [] if policy == "bc" else [f"policy.context={config.context}"]
-    resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
+    resolved = resolve_config(policy, None, [*config.settings, *settings], seed)
     run, shared = folder / name, SharedStages(folder / "stages")
     with label_progress(f"{folder.name}, {name}"):
         train_run(EpisodeStore.open(folder / "store"), run, resolved, shared=shared)

@@ -75,7 +75,6 @@ def test_a_table_is_a_dataclass() -> None:
         ({"hours": (1,)}, "shop.hours is (1,); it must be 2 values, each a whole number, or unset"),
         ({"staff": "Ann"}, "shop.staff is 'Ann'; it must be one or more values, each text"),
         ({"name": 3}, "shop.name is 3; it must be text"),
-        ({"name": ["x" * 100]}, f"shop.name is ['{'x' * 55}…; it must be text"),
         ({"shelfs": 2}, "shop has no field 'shelfs'; did you mean 'shelves'?"),
         ({"shelves": 300}, "shop.shelves is 300; no room for 0.25"),
     ],

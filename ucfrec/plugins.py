@@ -56,7 +56,7 @@ def plugin_package(group: str, name: str) -> str:
 
 
 def _entry(group: str, name: str) -> EntryPoint:
-    entries = [entry for entry in entry_points(group=f"ucfrec.{group}") if entry.name == name]
+    entries = list(entry_points(group=f"ucfrec.{group}", name=name))
     kind, *_ = _ONE_OF[group]
     if not entries:
         installed = ", ".join(plugin_names(group)) or "none"

@@ -48,13 +48,12 @@ def run_program(module: str) -> int:
     Until it is imported, Ctrl-C and TERM end the process with one line and status 130 or 143; once
     it has ended, they change nothing: without this, Python would give the signals back to the
     operating system while it ends, and the process would count as killed. Characters that the
-    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command. A
-    pipe gets each line when it is due.
+    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command.
     """
     _handle_signals(_end)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace", line_buffering=True)
+            stream.reconfigure(errors="replace")
     main: Callable[[], int] = import_module(module).main
     try:
         return main()
@@ -133,21 +132,6 @@ def block_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def end_with_parent() -> None:
-    """In a process of `multiprocessing`: end when the parent has ended, also when it was killed."""
-    import multiprocessing  # takes longer than the rest of this module
-
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        parent.join()
-        os._exit(128 + signal.SIGTERM)
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
-
-
 @contextmanager
 def pool_of_processes(
     workers: int, begin: Callable[[], None] | None = None
@@ -174,7 +158,17 @@ def pool_of_processes(
 
 
 def _begin(begin: Callable[[], None] | None) -> None:
-    end_with_parent()
+    """End when the parent has ended, also when it was killed; call `begin`."""
+    import multiprocessing  # takes longer than the rest of this module
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
     if begin is not None:
         begin()
 

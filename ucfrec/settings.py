@@ -136,8 +136,7 @@ def _setting_error(
         hint = nearest(field_name, list(infos))
         return SettingError(f"{name or table.__name__} has no field {field_name!r}; {hint}", key)
     allowed = allowed_values(table, field_name)
-    value = " ".join(repr(values[field_name]).split()) if field_name in values else "missing"
-    value = value if len(value) <= 60 else f"{value[:57]}…"
+    value = repr(values[field_name]) if field_name in values else "missing"
     return SettingError(f"{key} is {value}; it must be {allowed}", key)
 
 
@@ -272,10 +271,7 @@ def check_arguments(
 
         @wraps(function)
         def call(*args: _Parameters.args, **keywords: _Parameters.kwargs) -> _Result:
-            try:
-                bound = signature.bind(*args, **keywords)
-            except TypeError:
-                return function(*args, **keywords)  # raises the same with the function's name
+            bound = signature.bind(*args, **keywords)
             for name, value in bound.arguments.items():
                 is_default = value is None and signature.parameters[name].default is None
                 if name in checks and not is_default:

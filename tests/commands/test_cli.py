@@ -142,12 +142,6 @@ def test_score(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
     assert len(scores) == len(log) - 3
     columns = "user_id session timestamp item_id reward propensity probability rank greedy_item_id"
     assert list(scores.columns) == columns.split()
-    assert scores.session.nunique() == log[3:].session_id.nunique()
-    assert scores.probability.between(0, 1, inclusive="neither").all()
-    # The rule that takes the best item is certain of it.
-    assert main([*arguments, "--temperature", "0"]) == 0
-    best = pd.read_parquet(out)
-    assert (best.probability == (scores["rank"] == 1)).all()
 
 
 def save(table: ResultTable | pd.DataFrame) -> None:
@@ -422,8 +416,8 @@ def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> No
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
     assert all(row["band_low"] < row["band_high"] for row in ranked.values())
     for more, says in (
-        ([run, "--targets", "5,much"], "neither a return nor a quantile"),
-        ([run, "--temperatures", "1,hot"], "are not numbers; write e.g. 0,0.5,1"),
+        ([run, "--targets", "5,much"], "--targets: 'much' is not a number"),
+        ([run, "--temperatures", "1,hot"], "is not a number; write e.g. 0,0.5,1"),
         ([], "name a run folder"),
     ):
         assert says in refused(["ope", *more, str(logs)], capsys)
@@ -484,16 +478,12 @@ def test_score_and_ope_refuse(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_another_store_or_configuration_is_refused(folder: Path, capsys: Capsys) -> None:
+def test_a_run_of_another_store_is_refused(folder: Path, capsys: Capsys) -> None:
     run = str(folder / "synthetic-catalog-run")
     other = str(folder / "synthetic-taobao-store")
     assert "another store" in refused(["train", other, "--out", run, *settings()], capsys)
     store = str(folder / "synthetic-catalog-store")
-    changed = ["train", store, "--out", run, *settings("train.batch_size=8")]
-    assert "batch_size is 64 in the run, 8 now" in refused(changed, capsys)
     assert main(["train", store, "--out", run, *settings()]) == 0
-    elsewhere = ["evaluate", run, "--env", "synthetic-taobao"]
-    assert "which the policy was not trained on" in refused(elsewhere, capsys)
 
 
 @pytest.mark.parametrize(
@@ -525,6 +515,13 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     printed = refused(arguments.split(), capsys)
     assert re.search(says, printed), printed
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "run.json"}
+
+
+def test_numbers_out_of_their_range_are_refused(capsys: Capsys) -> None:
+    for number in ("0", "257", "9" * 20, "1.5"):
+        with pytest.raises(SystemExit):
+            main(["serve", "run", "--workers", number])
+        assert f"{number} is not a whole number from 1 to 256" in capsys.readouterr().err
 
 
 def test_errors_are_shown_whole() -> None:

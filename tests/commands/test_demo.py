@@ -19,9 +19,7 @@ from ucfrec.results.rows import read_results
 TINY = DemoConfig(
     sessions=300,
     episodes=100,
-    settings=("train.steps=20", "crm.epochs=1", "rule.sessions=10"),
-    context=4,
-    dim=16,
+    settings=("policy.dim=16", "train.steps=20", "crm.epochs=1", "rule.sessions=10"),
     methods=tuple(METHODS),
 )
 
@@ -49,7 +47,7 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(
             assert row.versions
         said = conclusion(environment, of_environment)
         assert f"UCF reaches {of_environment['ucf'].value:.3g} [" in said
-        assert ("With them, DT has" in said) == (SHARED in methods)
+        assert ("with the shared components" in said) == (SHARED in methods)
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
         assert f"R_cum in {environment}" in page

@@ -249,7 +249,7 @@ def test_a_refit_has_seen_the_test_split_too(
     with read_logged_sessions(trained, files, LogMapping()) as logged:
         assert share_seen(trained, logged.store) == 0
         assert share_seen(TrainedPolicy.load(again), logged.store) == 1
-    capsys.readouterr()
+    assert f"next: ucfrec ope {again} LOGS, its" in capsys.readouterr().out
     assert main(["rank", str(folder / "run"), str(again)]) == 2
     assert f"{again} is a refit" in capsys.readouterr().err
     assert main(["rank", str(folder / "run"), str(again), str(files[0])]) == 0

@@ -52,7 +52,6 @@ def test_the_names_of_the_package() -> None:
     assert {"UCF", "EpisodeStore", "Recommender", "prepare"} <= set(ucfrec.__all__)
     assert all(getattr(ucfrec, name) is not None for name in ucfrec.__all__)
     assert UCF is Recommender
-    assert UCF(settings=SMALL).config.policy_name == "ucf"
     with pytest.raises(AttributeError, match="no attribute 'Recommendation'"):
         ucfrec.Recommendation  # noqa: B018
 
@@ -291,9 +290,7 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
     scored = clicked.score(later, rule=rule)
     assert len(scored) == len(later)
     assert scored.probability.between(0, 1).all()
-    page = clicked.report(tmp_path / "report.html", [report])
-    text = page.read_text(encoding="utf-8")
-    assert "dt" in text
+    clicked.report(tmp_path / "report.html", [report])
     report.save(tmp_path / "ope.json")
     for given in (report, str(tmp_path / "ope.json")):
         assert clicked.report(tmp_path / "again.html", given).is_file()

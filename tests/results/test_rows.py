@@ -233,8 +233,9 @@ ROWS = [replace(_BARE, method="<b>", metrics=_OWN, interval=(1.0, 2.5), details=
 
 
 def test_a_frame_has_metrics_with_their_intervals_and_is_saved(tmp_path: Path) -> None:
-    ResultTable(ROWS, ()).save(tmp_path / "rows.json")
-    assert read_results(tmp_path / "rows.json") == ROWS
+    for name in ("rows.json", "rows"):
+        ResultTable(ROWS, ()).save(tmp_path / name)
+        assert read_results(tmp_path / name) == ROWS
     frame = ResultTable(ROWS, ()).to_frame().set_index("method")
     found = frame.loc["<b>", ["R", "R_low", "R_high", "S", "S_low", "S_high"]]
     assert found.tolist() == [1.5, 1.0, 2.5, 0.25, 0.125, 0.5]

@@ -3,9 +3,8 @@ options of all commands that measure the cells of a benchmark."""
 
 import os
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import ARGUMENT, SEED, Group, Table, settings_given
 from ucfrec.commands.shared_options import EnvironmentOptions
@@ -16,6 +15,7 @@ from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 if TYPE_CHECKING:
     from ucfrec.benchmark.suite import Benchmark as Suite
 
+ROWS_REMEDY: Final = "measure its rows again, or name another file with --results"
 _LOGS = Group("logs and seeds")
 
 
@@ -37,14 +37,6 @@ class GridOptions(Table):
     def rows_file(self) -> Path:
         """The file of result rows."""
         return self.results or self.out / "results.jsonl"
-
-    def explain_rows(self) -> AbstractContextManager[None]:
-        """For the block that prints rows: with --show-only, an `InputError` says what they lack.
-        Rows that were just measured lack nothing: there an error is ours, and keeps its trace."""
-        if not self.show_only:
-            return nullcontext()
-        remedy = "measure its rows again, or name another file with --results"
-        return damage_explained(self.rows_file, remedy)
 
     def read_rows(self, suite: str, tables: Sequence[str] = ()) -> list[ResultRow]:
         """The last rows of each measurement in the file.
@@ -92,7 +84,7 @@ class Benchmark(EnvironmentOptions, GridOptions):
         suite: Suite = load_plugin("benchmarks", self.suite)
         tables = select_names(suite.tables, self.table, "table")
         if self.show_only:
-            with self.explain_rows():
+            with damage_explained(self.rows_file, ROWS_REMEDY):
                 print(show(suite, tables, self.read_rows(self.suite, tables)))
             return
         settings = settings_given(self, BenchmarkRequest) | {"results": self.rows_file}

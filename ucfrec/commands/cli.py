@@ -10,9 +10,10 @@ import re
 import sys
 import textwrap
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib import import_module, metadata
 from typing import Any, Final
 
@@ -110,7 +111,8 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
             name = f"{program.name} {options.command}"
             table = program.find_table(options.command)
             with local_paths(options) as options:
-                table.read(options).execute()
+                values = {field.name: getattr(options, field.name) for field in fields(table)}  # type: ignore[arg-type]
+                table(**values).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -154,14 +156,12 @@ def explanation(error: BaseException) -> str | None:
 
 def _extra_with(module: str) -> str | None:
     """The smallest extra of ucfrec that brings a module which has the name of its distribution."""
-    name = re.escape(module.partition(".")[0].replace("_", "-"))
-    extras: dict[str, list[str]] = {}
-    for requirement in metadata.requires("ucfrec") or ():
-        if match := re.search(r"; extra == .(?!dev|docs)(\w+).", requirement):
-            extras.setdefault(match[1], []).append(requirement)
-    brings = re.compile(rf"{name}\b[^-]", re.IGNORECASE)
-    suitable = [extra for extra, packages in extras.items() if any(map(brings.match, packages))]
-    return min(suitable, key=lambda extra: len(extras[extra]), default=None)
+    name = module.partition(".")[0].replace("_", "-").lower()
+    lines = "\n".join(metadata.requires("ucfrec") or ()).lower()
+    pairs = re.findall(r"(?m)^([\w-]+).*; extra == .(?!dev|docs)(\w+)", lines)
+    sizes = Counter(extra for _, extra in pairs)
+    suitable = [extra for package, extra in pairs if package == name]
+    return min(suitable, key=lambda extra: sizes[extra], default=None)
 
 
 _NO_MEMORY: Final = (

@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,18 +17,21 @@ if TYPE_CHECKING:
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
+CONTEXT = "policy.context=11"
 PLAIN = ("policy.exposure=false", "rule.choose=false")
 """Settings of a method as its authors describe it: the best item at the largest training return."""
 METHODS: dict[str, tuple[str, ...]] = {
     "bc": ("bc", *PLAIN),
-    "dt": ("dt", *PLAIN),
-    SHARED: ("dt", "policy.exposure=true", "rule.choose=true"),
-    "ucf-no-augmentation": ("ucf",),
-    "ucf": ("ucf", "augment.copies=1"),
+    "dt": ("dt", CONTEXT, *PLAIN),
+    SHARED: ("dt", CONTEXT, "policy.exposure=true", "rule.choose=true"),
+    "ucf-no-augmentation": ("ucf", CONTEXT),
+    "ucf": ("ucf", CONTEXT, "augment.copies=1"),
 }
 """Name in the results to the policy and the settings that it has besides `DemoConfig.settings`."""
 BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}
 """Name in the results to the built-in policy that is evaluated for comparison."""
+_say = partial(print, flush=True)
+"""Print at once, so that a pipe shows each line when it is due."""
 EVALUATION_SEED = 1_000_000
 """Added to the log seed, so that no evaluated session is one of the logged sessions."""
 
@@ -41,14 +45,13 @@ class DemoConfig:
     episodes: int = 500
     """Evaluated episodes of each policy."""
     settings: Sequence[str] = (
+        "policy.dim=32",
         "train.steps=300",
         "train.learning_rate=2e-3",
         "crm.epochs=4",
         "rule.sessions=50",
         "rule.evidence=0",
     )
-    context: int = 11
-    dim: int = 32
     methods: Sequence[str] = ("dt", SHARED, "ucf")
     """Names of `METHODS`."""
 
@@ -61,8 +64,7 @@ class DemoConfig:
 FULL = DemoConfig(
     sessions=6000,
     episodes=1000,
-    settings=("train.steps=1500", "train.learning_rate=1e-3", "crm.epochs=8"),
-    dim=64,
+    settings=("policy.dim=64", "train.steps=1500", "train.learning_rate=1e-3", "crm.epochs=8"),
     methods=tuple(METHODS),
 )
 """Sizes at which the methods differ as in the documentation: a quarter of an hour on two cores."""
@@ -87,7 +89,7 @@ class Demo(Table):
 
         config = FULL if self.full else DemoConfig()
         out = self.out or Path("demo-out-full" if self.full else "demo-out")
-        print(
+        _say(
             f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
             f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
             f"simulators. Everything goes to {out}."
@@ -95,49 +97,34 @@ class Demo(Table):
         with lock_path(out, "filled"):
             remove_leftovers(out.parent)
             rows = demo(out, self.seed, config)
-        print(f"\n{evaluation_table(rows)}\n")
-        print("What this shows (return: sum of the rewards of a session; [95% interval]):")
+        _say(f"\n{evaluation_table(rows)}\n")
+        _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
         for environment in ENVIRONMENTS:
             by_method = {row.method: row for row in rows if row.environment == environment}
-            print(conclusion(environment, by_method))
-        print(f"Report with all curves and tables: {out / 'report.html'}")
-        print("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
+            _say(conclusion(environment, by_method))
+        _say(f"Report with all curves and tables: {out / 'report.html'}")
+        _say("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
 
 def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
     """What the rows of an environment, by method, show, in words."""
     values = {method: _describe_value(row) for method, row in rows.items()}
-    lines = [
+    shared = "there are no shared components, as actions are vectors"
+    if SHARED in rows:
+        shared = (
+            f"with the shared components, which UCF has too and any method can use, DT has\n"
+            f"  {values[SHARED]} (exposure features, reward weight, selected decision rule)"
+        )
+    return (
         f"- {environment}: logged sessions have {values['logging']}, random actions "
         f"{values['random']}, the best\n  possible ones {values['optimal']}. From the log alone, "
-        f"UCF reaches {values['ucf']}."
-    ]
-    if SHARED in rows:
-        lines.append(
-            "  Every method can use the shared components (exposure features, reward weight,\n"
-            f"  selected decision rule). With them, DT has {values[SHARED]}: "
-            f"{_compare(rows[SHARED], rows['dt'], 'DT without them')},\n"
-            f"  {values['dt']}. UCF, which has them too, is "
-            f"{_compare(rows['ucf'], rows[SHARED], 'DT with them')}."
-        )
-    else:
-        lines.append(
-            f"  Actions are vectors, so there are no shared components: UCF is "
-            f"{_compare(rows['ucf'], rows['dt'], 'DT')}, {values['dt']}."
-        )
-    return "\n".join(lines)
+        f"UCF reaches {values['ucf']}, DT {values['dt']};\n  {shared}.\n"
+        "  Where two intervals overlap, the order is open."
+    )
 
 
 def _describe_value(row: "ResultRow") -> str:
     return f"{row.value:.3g} [{row['R_cum_low']:.3g}, {row['R_cum_high']:.3g}]"
-
-
-def _compare(row: "ResultRow", reference: "ResultRow", name: str) -> str:
-    """How a return compares with another one, by 95% intervals that do not overlap."""
-    if row["R_cum_low"] > reference["R_cum_high"]:
-        return f"above {name}"
-    below = row["R_cum_high"] < reference["R_cum_low"]
-    return f"below {name}" if below else f"level with {name} (the intervals overlap)"
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
@@ -158,7 +145,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
-        print(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
+        _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
         collect_store(Environment(environment), out / environment, config.sessions, seed)
     jobs = [
         (environment, name) for environment in ENVIRONMENTS for name in config.names(environment)
@@ -171,11 +158,11 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     with pool_of_processes(workers) as pool:
         with block_ctrl_c():
             futures = {pool.submit(_learn, out / job[0], job[1], seed, config): job for job in jobs}
-        print(f"Training {len(jobs)} policies, {workers} at a time …")
+        _say(f"Training {len(jobs)} policies, {workers} at a time …")
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for future in as_completed(futures):
                 row = rows[futures[future]] = future.result()
-                print(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
+                _say(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
                 bar.update()
     ordered, runs = [], []
     for environment in ENVIRONMENTS:
@@ -206,9 +193,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
 
     torch.set_num_threads(1)
     policy, *settings = METHODS[name]
-    size = [f"policy.dim={config.dim}"]
-    size += [] if policy == "bc" else [f"policy.context={config.context}"]
-    resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
+    resolved = resolve_config(policy, None, [*config.settings, *settings], seed)
     run, shared = folder / name, folder / "stages"
     with label_progress(f"{folder.name}, {name}"):
         train_run(EpisodeStore.open(folder / "store"), run, resolved, shared=shared)

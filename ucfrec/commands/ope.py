@@ -1,12 +1,11 @@
 """`ucfrec ope`: the return of a policy, estimated from logs alone; `score`: what it needs of the
 policy; `rank`: how policies rank what users were shown and clicked later."""
 
-import math
+import shlex
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
@@ -136,13 +135,11 @@ class Ope(RuleOptions, LogOptions):
         targets, temperatures = [base.target], [base.temperature]
         if self.targets is not None:
             targets = [_read_target(part.strip(), trained) for part in self.targets.split(",")]
-        try:
-            if self.temperatures is not None:
-                temperatures = [float(part) for part in self.temperatures.split(",")]
-        except ValueError:
-            raise InputError(
-                f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
-            ) from None
+        if self.temperatures is not None:
+            temperatures = [
+                _read_number("--temperatures", part, "0,0.5,1")
+                for part in self.temperatures.split(",")
+            ]
         rules = [
             replace(base, target=target, temperature=temperature)
             for target in targets
@@ -211,17 +208,15 @@ def _next_step(verdict: "Verdict") -> str:
 
 def _read_target(part: str, trained: "TrainedPolicy") -> float:
     """A target return: a number in units of the reward, or `q` and a quantile."""
-    quantile = part.startswith("q")
+    value = _read_number("--targets", part.removeprefix("q"), "5,10 or q0.5,q0.9")
+    return trained.target_return(value) if part.startswith("q") else value
+
+
+def _read_number(option: str, word: str, example: str) -> float:
     try:
-        value = float(part.removeprefix("q"))
+        return float(word)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
-        raise InputError(
-            f"--targets: {part!r} is neither a return nor a quantile of the training returns; "
-            "write e.g. 5,10 or q0.5,q0.9"
-        )
-    return trained.target_return(value) if quantile else value
+        raise InputError(f"{option}: {word!r} is not a number; write e.g. {example}") from None
 
 
 class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
@@ -315,7 +310,7 @@ class Rank(LogOptions, RuleOptions):
         print(_describe_ranking(ranking))
         if self.json is not None:
             ranking.save(self.json)
-        print(_conclude_ranking(ranking, runs[0]))
+        print(_conclude_ranking(ranking, [str(runs[0]), *map(origin, logs)]))
 
 
 def _describe_ranking(ranking: "Ranking") -> str:
@@ -340,18 +335,18 @@ def _describe_ranking(ranking: "Ranking") -> str:
     return "\n".join([*lines, *(f"warning: {warning}" for warning in ranking.warnings)])
 
 
-def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
-    """What the rows show, in two lines: the best by liked items, and what to do next."""
-    rates = {n: row.metrics.get("hit_rate_liked", math.nan) for n, row in enumerate(ranking)}
-    rates = {n: rate for n, rate in rates.items() if not math.isnan(rate)}
-    if 0 not in rates:
+def _conclude_ranking(ranking: "Ranking", measured: Sequence[str]) -> str:
+    """What the rows show, in two lines: the best by liked items, and what to do next with the run
+    and the logs that were measured."""
+    rows, name = ranking.rows, "hit_rate_liked"
+    if name not in rows[0].metrics:
         return "\nno step was liked; next: name what counts as liked with --liked"
-    rows, best = ranking.rows, max(rates, key=lambda n: rates[n])
-    if not rates[best]:
+    best = max(rows, key=lambda row: row.metrics.get(name, 0.0))
+    if not best.metrics[name]:
         return "\nno method lists an item that was liked; next: a larger --k, or --keep-seen"
-    first = f"; {rows[0].method} has {rates[0]:.3f}" if best else ""
+    first = "" if best is rows[0] else f"; {rows[0].method} has {rows[0].metrics[name]:.3f}"
     return (
-        f"\n{rows[best].method} has the highest hit rate on liked items ({rates[best]:.3f} with "
-        f"{rows[best].conditions['k']} items){first}. Logged clicks favour what was shown:\n"
-        f"next: ucfrec ope {quote(str(run))}, the return per session that it would bring"
+        f"\n{best.method} has the highest hit rate on liked items ({best.metrics[name]:.3f} with "
+        f"{best.conditions['k']} items){first}. Logged clicks favour what was shown:\n"
+        f"next: ucfrec ope {shlex.join(measured)}, the return per session that it would bring"
     )

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
 from importlib.util import find_spec
-from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -22,7 +21,6 @@ from typing import (
     ClassVar,
     Final,
     Literal,
-    Self,
     Union,
     dataclass_transform,
     get_args,
@@ -85,11 +83,6 @@ class Table:
         """
         raise NotImplementedError
 
-    @classmethod
-    def read(cls, options: argparse.Namespace) -> Self:
-        """The table with the values of a command line."""
-        return cls(**{field.name: getattr(options, field.name) for field in fields(cls)})  # type: ignore[arg-type]
-
 
 def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[str, Any]:
     """The fields of a settings table that the command line names."""
@@ -119,8 +112,9 @@ def add_options(
         hint = hints[field.name]
         kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         owner = next(cls for cls in table.__mro__ if field.name in inspect.get_annotations(cls))
-        titles = [mark for mark in marks if isinstance(mark, Group)]
-        title, _, more = (titles or [Group(vars(owner).get("title") or "")])[0].partition("; ")
+        of_class = vars(owner).get("title") or ""
+        title = next((mark for mark in marks if isinstance(mark, Group)), of_class)
+        title, _, more = title.partition("; ")
         if title not in groups:
             groups[title] = parser.add_argument_group(title, (everything and more) or None)
         group = groups[title]
@@ -220,9 +214,9 @@ def read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     for cls in ast.parse(source).body:
         if not isinstance(cls, ast.ClassDef):
             continue
-        for line, next_line in zip_longest(cls.body, cls.body[1:]):
+        for number, line in enumerate(cls.body, 1):
             if isinstance(line, ast.AnnAssign):
-                text = ast.literal_eval(next_line.value) if isinstance(next_line, ast.Expr) else ""
+                text = ast.get_docstring(ast.Module(cls.body[number:], [])) or ""
                 default = "" if line.value is None else ast.unparse(line.value)
                 default = "" if default in ("None", "False") else default.strip("'")
                 texts[f"{cls.name}.{ast.unparse(line.target)}"] = " ".join(text.split()), default

@@ -52,8 +52,7 @@ class Prepare(LogOptions, SparkOption):
             options["reward"] = Expression(self.reward, "--reward")
         if self.split is not None:
             options["split"] = parse_split(self.split)
-        if (master := self.find_spark()) is not None:
-            options["spark_master"] = master
+        self.find_spark()  # refuses a master of another engine
         how = PrepareOptions(**options)
         if self.validate:
             print(format_report(validate(files, mapping, how)))

@@ -59,7 +59,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             )
         from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.recommending.histories import histories_of_files
-        from ucfrec.recommending.recommend import recommend
+        from ucfrec.recommending.recommend import ItemIndex, recommend
 
         if (master := self.find_spark()) is None:
             require_table_names([self.out, self.exposures])
@@ -94,8 +94,6 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             print(f"{origin(self.out)}: {rows:,} rows")
             return
         if self.approximate:
-            from ucfrec.recommending.recommend import ItemIndex
-
             index = ItemIndex(trained.item_scorer(rule), trained.name)
         with progress(None, "recommend", "users") as bar:
 

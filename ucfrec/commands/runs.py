@@ -104,18 +104,14 @@ def _verify(path: Path) -> int:
             f"{path} is neither an episode store (meta.json) nor a run (run.json); check the path"
         )
     faults = list(record.faults(path))
-    for name, fault in faults:
-        print(one_line(f"{path / name} {fault}"))
-    for name in record.strangers(path):
-        if name != record.FILE:
-            print(one_line(f"{path / name} is not listed in {record.FILE}: it was added later"))
-    refit = path / REFIT
-    more = _verify(refit) if (refit / RunRecord.FILE).is_file() else 0
+    lines = [f"{path / name} {fault}" for name, fault in faults]
+    added = f"is not listed in {record.FILE}: it was added later"
+    lines += [f"{path / name} {added}" for name in record.strangers(path) if name != record.FILE]
     size = sum(size for size, _ in record.files.values()) / 1e6
-    print(
-        one_line(
-            f"{path}: {len(record.files) - len(faults)} of {len(record.files)} files have the "
-            f"content that was written ({size:,.1f} MB{unfinished})"
-        )
+    lines.append(
+        f"{path}: {len(record.files) - len(faults)} of {len(record.files)} files have the content "
+        f"that was written ({size:,.1f} MB{unfinished})"
     )
-    return len(faults) + more
+    print(*map(one_line, lines), sep="\n")
+    refit = path / REFIT
+    return len(faults) + (_verify(refit) if (refit / RunRecord.FILE).is_file() else 0)

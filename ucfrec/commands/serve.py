@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import ARGUMENT, POSITIVE, Group, Table, settings_given
 from ucfrec.commands.shared_options import AnswerOptions
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputNote
 from ucfrec.processes import Interrupted
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Serve(AnswerOptions):
     engine: Annotated[Literal["torch", "onnxruntime"], _SERVER] = "torch"
     """What computes the network of requests that are not batched; onnxruntime is faster, but needs
     ucfrec[export] and some 10 seconds at the start"""
-    workers: Annotated[int, _SERVER, "N"] = 1
+    workers: Annotated[int, _SERVER, range(1, 257), "N"] = 1
     """Processes that answer on the address, each with the run in its memory."""
     threads: Annotated[int | None, _SERVER, POSITIVE, "N"] = None
     """Threads per forward pass (default: one per core, divided by --workers)"""
@@ -60,15 +60,12 @@ class Serve(AnswerOptions):
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
         from ucfrec.recommending.server import (
-            MOST,
             PrintingServer,
             Workers,
             listening_socket,
             ready_line,
         )
 
-        if not 1 <= self.workers <= MOST:
-            raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
         address = listening_socket(self.host, self.port)
         if self.workers == 1:
             self._serve(address, PrintingServer)

@@ -109,8 +109,11 @@ class Train(TrainingOptions):
         if record.rule is None:
             print(f"next: ucfrec evaluate {run} --env NAME, in a simulator of these actions")
         else:
+            held_out = ", its value on the test split of the store"
+            if record.refit_of is not None:
+                held_out = " LOGS, its value on later logs"
             print(
-                f"next: ucfrec ope {run}, its value on the test split of the store\n"
+                f"next: ucfrec ope {run}{held_out}\n"
                 f"      ucfrec recommend {run} LOGS --out FILE, the next items of every user"
             )
 

@@ -29,8 +29,6 @@ from ucfrec.processes import Interrupted, block_ctrl_c, interruptions_raised
 
 METRICS: Final = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of the folder in which workers share their metrics."""
-MOST: Final = 256
-"""Workers."""
 _PAUSE: Final = 10.0
 """Seconds after which a worker that could not start is tried again."""
 _SPAWN: Final = get_context("spawn")

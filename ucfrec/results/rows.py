@@ -196,7 +196,7 @@ def read_rows(path: Path) -> list[ResultRow]:
 
 
 def read_results(path: Path) -> list[ResultRow]:
-    """Read the rows of JSON lines, or of a JSON list (`.json`) as commands write with `--json`.
+    """Read the rows of JSON lines, or of a JSON list as commands write with `--json`.
 
     Raises:
         InputError: the file is missing or has other content.
@@ -204,7 +204,9 @@ def read_results(path: Path) -> list[ResultRow]:
     if path.suffix != ".json":
         if not path.exists():
             raise InputError(f"{path} does not exist; check the path")
-        return read_rows(path)
+        with path.open("rb") as file:
+            if file.read(1) != b"[":
+                return read_rows(path)
     rows = atomic.read_json(path)
     if not isinstance(rows, list):
         raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")

@@ -3,14 +3,15 @@
 import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.benchmark.grid import run_grid
-from ucfrec.commands.benchmark import GridOptions
+from ucfrec.commands.benchmark import ROWS_REMEDY, GridOptions
 from ucfrec.commands.options import ARGUMENT, SEED, Table
-from ucfrec.errors import InputError, one_line
+from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.results.rows import ResultRow, benchmarking
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
@@ -106,6 +107,12 @@ class ControlGridOptions(GridOptions):
                 "that are there"
             )
         return self.data
+
+    def explain_rows(self) -> AbstractContextManager[None]:
+        """For the block that prints rows: with --show-only, an `InputError` says what they lack.
+        Rows that were just measured lack nothing: there an error is ours, and keeps its trace."""
+        shown = damage_explained(self.rows_file, ROWS_REMEDY)
+        return shown if self.show_only else nullcontext()
 
     def measure(self, cells: Iterable[Cell], how: Measurement, describe: str) -> list[ResultRow]:
         """The rows of cells, which are measured where they have none."""

@@ -204,7 +204,7 @@ def test_the_command_recommends_candidates_only(
 
 def test_unknown_items_are_refused_or_skipped(policy: Recommender, log: pd.DataFrame) -> None:
     strange = pd.concat([log, log.tail(9).assign(item_id=999, timestamp=log.timestamp.max() + 1)])
-    with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 item: 999\)"):
+    with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 items: 999\)"):
         policy.recommend(strange)
     best = replace(policy.trained.rule, temperature=0.0)
     pd.testing.assert_frame_equal(
@@ -412,7 +412,7 @@ def test_frames_files_and_the_store_have_the_same_histories(
     ("command", "written"),
     [
         ("recommend", "log.parquet"),
-        ("recommend", "run/run.json"),
+        ("recommend", "run/items.parquet"),
         ("score", "log.parquet"),
     ],
 )

@@ -111,8 +111,7 @@ def _read_plain(frame: pd.DataFrame, by_id: bool, duplicates: str) -> Histories 
     """
     if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
         return None
-    names = {schema.USER_ID: "user", schema.ITEM_ID: schema.ITEM}
-    names |= {schema.TIMESTAMP: schema.TIMESTAMP}
+    names = {schema.USER_ID: "user", schema.ITEM_ID: schema.ITEM, schema.TIMESTAMP: "timestamp"}
     names |= {schema.SESSION_ID: "session"} if by_id else {}
     if {*frame.columns} != {*names, schema.REWARD} or frame.shape[1] != len(names) + 1:
         return None

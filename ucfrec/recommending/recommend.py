@@ -232,10 +232,8 @@ def _refuse_unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError
         unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
         rows += len(unknown)
         items |= set(unknown.tolist())
-    have = "row has" if rows == 1 else "rows have"
-    count = "1 item" if len(items) == 1 else f"{len(items)} items"
     return InputError(
-        f"{rows} {have} an item_id that the policy does not know ({count}: "
+        f"{rows} rows have an item_id that the policy does not know ({len(items)} items: "
         f"{name_some(sorted(items))}); prepare and train on logs with them, or leave those rows "
         "out with --skip-unknown (skip_unknown=True in Python)"
     )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, NotRequired
 
@@ -202,11 +203,12 @@ class RowRewards:
     def __init__(self, expression: Expression) -> None:
         self._expression, self._computed = expression, computes_with_reward(expression)
         self._stack = ExitStack()
-        self._connection: duckdb.DuckDBPyConnection | None = None
-
-    def close(self) -> None:
+        self.close = self._stack.close
         """Close the engine."""
-        self._stack.close()
+
+    @cached_property
+    def _connection(self) -> duckdb.DuckDBPyConnection:
+        return self._stack.enter_context(engine((), None, _MEMORY))
 
     def of_rows(self, rows: Sequence[Mapping[str, Any]]) -> list[float]:
         """Rewards (N,) of rows; InputError for one that is missing, not finite or too large."""
@@ -222,8 +224,6 @@ class RowRewards:
         return _require_numbers(self._evaluate(rows), "no reward")
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        if self._connection is None:
-            self._connection = self._stack.enter_context(engine((), None, _MEMORY))
         connection, source = self._connection, Path(_ROWS)
         names, columns = {name.casefold() for row in rows for name in row}, {}
         for name in columns_of(connection, self._expression):
@@ -241,23 +241,20 @@ class RowRewards:
                     f"history: {name} has values of several types ({reason})"
                 ) from None
         connection.register(_ROWS, pa.table(columns))
+        described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
+        table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
         try:
-            described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
-            table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
-            try:
-                with explain_errors(connection, (table,), source):
-                    sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
-                    query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
-                    values = [row[0] for row in connection.sql(query).fetchall()]
-            except InputError:
-                # Its text names files of the server.
-                types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
-                raise InputError(
-                    f"history: the run's reward ({self._expression}) cannot be computed where "
-                    f"{types}; give values of the types that the training log has"
-                ) from None
-        finally:
-            connection.unregister(_ROWS)
+            with explain_errors(connection, (table,), source):
+                sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
+                query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
+                values = [row[0] for row in connection.sql(query).fetchall()]
+        except InputError:
+            # Its text names files of the server.
+            types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
+            raise InputError(
+                f"history: the run's reward ({self._expression}) cannot be computed where "
+                f"{types}; give values of the types that the training log has"
+            ) from None
         if not (is_number(kind) or kind == "BOOLEAN"):
             raise InputError(f"history: the run's reward is {kind} here; give numbers")
         return values

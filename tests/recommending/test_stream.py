@@ -135,15 +135,6 @@ def test_a_history_replaces_what_the_stream_has_had(trained: TrainedPolicy) -> N
     pd.testing.assert_frame_equal(shown(found), shown(expected), rtol=1e-5)
 
 
-def test_a_stream_takes_no_logs(
-    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["recommend", str(trained.folder), "log.parquet", "--stream"]) == 2
-    assert "leave LOGS and --out out" in capsys.readouterr().err
-    assert main(["recommend", str(trained.folder)]) == 2
-    assert "name LOGS after the run and the file to write" in capsys.readouterr().err
-
-
 def test_a_stream_that_fails_closes_what_answers(
     trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,8 +51,6 @@ _EARLIEST_MS: Final = 365 * DAY_MS
 _LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 _MOST_FAULTS: Final = 1000
 """Beyond this number, it would take too long to look at each."""
-_SHOWN: Final = 60
-"""Most characters of a wrong value in a message."""
 _TYPES: Final = ("constrained-str", "float", "constrained-int")
 """Last part of pydantic's place of an error in one of several types."""
 _ROWS: Final = "history"
@@ -156,9 +154,8 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
         "items (k)": (request.k or 1, limits.k),
         "rows of history": (len(request.history), limits.history),
         "candidates": (len(request.candidates or ()), limits.candidates),
+        "interactions": (len(getattr(request, "interactions", ())), limits.history),
     }
-    if isinstance(request, StreamRequest):
-        counts["interactions"] = (len(request.interactions), limits.history)
     for name, (count, most) in counts.items():
         if count > most:
             raise InputError(f"{count:,} {name}: the limit is {most:,}; request less")
@@ -178,9 +175,8 @@ def _describe(errors: Sequence[Any]) -> str:
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
     same = zip(errors, places, strict=True)
     messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
-    value = json.dumps(first.get("input"), default=str)
-    value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
-    actual = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
+    value = first.get("input")
+    actual = "" if isinstance(value, dict | list) else f", not {json.dumps(value, default=str):.60}"
     return (
         f"{where}: {' or '.join(messages)}{actual}"
         f"{f'; {more} more fault' + 's' * (more > 1) if more else ''}"

@@ -123,8 +123,6 @@ class Responder:
         scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
-        if engine not in (TORCH, ONNXRUNTIME):
-            raise InputError(f"the engine is {engine!r}; give {TORCH} or {ONNXRUNTIME}")
         if engine == ONNXRUNTIME:
             from ucfrec.recommending.export import ScoreGraph
 
@@ -303,15 +301,12 @@ class Served:
                 return self._arms[0].responder.answers(requests)
             shares = [arm.share for arm in self._arms]
             places = [arm_of(request.user_id, shares) for request in requests]
-            answers: dict[int, Answer | InputError] = {}
-            for number in set(places):
-                rows, arm = [n for n, p in enumerate(places) if p == number], self._arms[number]
-                outcomes = arm.responder.answers([requests[row] for row in rows])
-                for row, outcome in zip(rows, outcomes, strict=True):
-                    if isinstance(outcome, Answer):
-                        outcome = outcome._replace(arm=arm.name)
-                    answers[row] = outcome
-            return [answers[row] for row in range(len(requests))]
+            outcomes = []
+            for number, arm in enumerate(self._arms):
+                of_arm = [r for r, place in zip(requests, places, strict=True) if place == number]
+                outcomes.append(iter(arm.responder.answers(of_arm)))
+            answers = ((self._arms[place].name, next(outcomes[place])) for place in places)
+            return [a._replace(arm=name) if isinstance(a, Answer) else a for name, a in answers]
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""

@@ -316,12 +316,12 @@ class HistoryReader:
         }
         sessions = None
         if self.by_session_id:
-            for n, row in enumerate(rows):
-                if row.get("session_id") is None:
-                    raise InputError(
-                        f"history.{n} has no session_id, by which the run splits sessions"
-                    )
-            sessions = id_array([row["session_id"] for row in rows])
+            ids: list[Any] = [row.get("session_id") for row in rows]
+            if None in ids:
+                raise InputError(
+                    f"history.{ids.index(None)} has no session_id, by which the run splits sessions"
+                )
+            sessions = id_array(ids)
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
             observed = [row.get("observation") or () for row in rows]

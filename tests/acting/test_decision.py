@@ -112,6 +112,7 @@ def test_only_the_best_are_drawn_from() -> None:
     torch.testing.assert_close(many.log_probabilities(SCORES).exp(), SCORES.softmax(1))
     few = torch.tensor([[-math.inf, 1.0, -math.inf, -math.inf]])
     assert rule.log_probabilities(few).exp().tolist() == [[0, 1, 0, 0]]
+    assert rule.log_probabilities(torch.zeros(1, 4)).exp().tolist() == [[0.5, 0.5, 0, 0]]
 
 
 RANDOM = [

@@ -87,13 +87,10 @@ def test_hostile_values_are_refused_in_one_line(case: str) -> None:
 
 
 @pytest.mark.parametrize("temperature", [0.25, 1.0, 3.0])
-def test_probabilities_by_hand(temperature: float) -> None:
+def test_probabilities_are_a_softmax(temperature: float) -> None:
     rule = DecisionRule(0.0, temperature=temperature)
-    found = rule.log_probabilities(SCORES).exp()
-    for row, scores in enumerate(SCORES.tolist()):
-        chances = [math.exp(score / temperature) for score in scores]
-        expected = [chance / sum(chances) for chance in chances]
-        assert found[row].tolist() == pytest.approx(expected, rel=1e-5)
+    expected = (SCORES / temperature).softmax(1)
+    torch.testing.assert_close(rule.log_probabilities(SCORES).exp(), expected)
 
 
 @pytest.mark.parametrize("temperature", [1e-300, 1e-30, 1e-9, 1e6])
@@ -115,6 +112,7 @@ def test_only_the_best_are_drawn_from() -> None:
     torch.testing.assert_close(many.log_probabilities(SCORES).exp(), SCORES.softmax(1))
     few = torch.tensor([[-math.inf, 1.0, -math.inf, -math.inf]])
     assert rule.log_probabilities(few).exp().tolist() == [[0, 1, 0, 0]]
+    assert rule.log_probabilities(torch.zeros(1, 4)).exp().tolist() == [[0.5, 0.5, 0, 0]]
 
 
 RANDOM = [

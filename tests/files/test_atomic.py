@@ -208,19 +208,3 @@ def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:
     assert [os.waitpid(child, 0)[1] for child in children] == [0] * 3
     assert path.read_text() == "45"
     assert names(tmp_path) == ["count"]
-
-
-def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_path: Path) -> None:
-    def write() -> None:
-        with atomic_folder(tmp_path / "out") as scratch:
-            for name in range(200):
-                (scratch / str(name)).write_text("x")
-
-    for attempt in range(10):
-        kill(forked(write), 0.002 * attempt)
-        if (tmp_path / "out").exists():
-            assert len(names(tmp_path / "out")) == 200
-            (tmp_path / "out").rename(tmp_path / f"whole-{attempt}")
-    with atomic_folder(tmp_path / "last"):
-        pass
-    assert not [name for name in names(tmp_path) if name.startswith(".")]

@@ -133,8 +133,8 @@ def test_a_log_that_compresses_as_logs_do_passes(
 
 def test_a_table_is_of_the_kind_that_its_name_says(tmp_path: Path) -> None:
     frames = [pd.DataFrame({"user_id": ["a", "b,"], "score": [0.1, 1e-300]}) for _ in range(2)]
-    readers = {"t": pd.read_parquet, "t.parquet": pd.read_parquet, "t.CSV": pd.read_csv}
-    for name, read in readers.items():
+    for name in ("t", "t.parquet", "t.CSV"):
+        read = pd.read_csv if name.endswith("CSV") else pd.read_parquet
         assert write_frames(tmp_path / name, frames, {"about": "it"}) == 4
         pd.testing.assert_frame_equal(read(tmp_path / name), pd.concat(frames, ignore_index=True))
     with pytest.raises(InputError, match="CSV has no lists, as in the column tags; name a file"):
@@ -146,14 +146,14 @@ def test_a_table_is_of_the_kind_that_its_name_says(tmp_path: Path) -> None:
 def test_tables_of_another_kind_are_refused_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    out = ["--out", str(tmp_path / name)]
-    shown = ["none", "none.parquet", "--out", str(tmp_path / "a.csv"), "--exposures", out[1]]
-    for arguments in (
-        ["recommend", "none", "none.parquet", *out],
-        ["recommend", *shown],
-        ["score", "none", "none.parquet", *out],
+    out, says = str(tmp_path / name), f"{name}: tables are written as Parquet or CSV; name a"
+    recommend = ["recommend", "no run", "no log", "--out"]
+    for command in (
+        [*recommend, out],
+        [*recommend, "a.csv", "--exposures", out],
+        ["score", "no run", "no log", "--out", out],
     ):
-        assert main(arguments) == 2
-        assert f"{name}: tables are written as Parquet or CSV; name a" in capsys.readouterr().err
-    with pytest.raises(InputError, match=f"{name}: tables are written as Parquet or CSV"):
+        assert main(command) == 2
+        assert says in capsys.readouterr().err
+    with pytest.raises(InputError, match=says):
         join_feedback([tmp_path], [tmp_path], tmp_path / name, 1)

@@ -243,13 +243,13 @@ def test_answers_are_those_of_torch(
     ending: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = [*requests_of(histories()), {"user_id": "new", "request_id": "1"}]
-    graph, alone = fast._chooser.scorer._engine, []
+    graph, alone = fast._chooser.scorer.engine, []
 
     def counted(sessions: Sessions, excluded: Tensor) -> Any:
         alone.append(len(sessions.users))
         return graph(sessions, excluded)
 
-    monkeypatch.setattr(fast._chooser.scorer, "_engine", counted)
+    monkeypatch.setattr(fast._chooser.scorer, "engine", counted)
     expected = answered(responder(ending, rule=fast.rule, k=24), asked)
     one_by_one = pd.concat([answered(fast, [each]) for each in asked], ignore_index=True)
     pd.testing.assert_frame_equal(one_by_one, expected, rtol=1e-5, atol=1e-5)

@@ -130,7 +130,7 @@ def test_a_user_who_has_seen_everything_gets_nothing(trained: TrainedPolicy) -> 
 def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> None:
     requests = requests_of(histories(users=3))
     wrong = [
-        ({"user_id": 1, "candidates": [3, 999]}, r"1 of 2 candidates .* \(999\)"),
+        ({"user_id": 1, "candidates": [3, 999]}, r"1 of 2 named items .* \(999\)"),
         ({"user_id": 1, "history": [{"item_id": "x", "timestamp": 1.7e12, "reward": 0}]}, r"\(x\)"),
         ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12}]}, "0 has no reward;"),
         ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 5, "reward": 0}]}, "before 1971"),
@@ -149,7 +149,7 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
     skipping, some, none = by.answers([Request.model_validate(wrong[1][0]), *unknown])
     assert isinstance(skipping, Answer)
     assert some.items == [5]
-    assert "2 of 2 candidates are items that the policy does not know" in str(none)
+    assert "2 of 2 named items are not known to the policy" in str(none)
 
 
 @pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), float("nan"), 2e12, "1"])

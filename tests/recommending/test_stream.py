@@ -14,10 +14,7 @@ import pytest
 
 from tests.support.served import as_frame, histories, requests_of, responder, with_rule
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
-from ucfrec.recommending import stream
 from ucfrec.recommending.requests import Limits
-from ucfrec.recommending.responder import Responder
 from ucfrec.recommending.stream import answer_stream
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -133,31 +130,6 @@ def test_a_history_replaces_what_the_stream_has_had(trained: TrainedPolicy) -> N
     told = (rows, rows[:3], rows[:5], [], [])
     expected = streamed(trained, lines([{"user_id": user, "history": each} for each in told]))
     pd.testing.assert_frame_equal(shown(found), shown(expected), rtol=1e-5)
-
-
-def test_a_stream_takes_no_logs(
-    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["recommend", str(trained.folder), "log.parquet", "--stream"]) == 2
-    assert "leave LOGS and --out out" in capsys.readouterr().err
-    assert main(["recommend", str(trained.folder)]) == 2
-    assert "name LOGS after the run and the file to write" in capsys.readouterr().err
-
-
-def test_a_stream_that_fails_closes_what_answers(
-    trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    closed: list[Responder] = []
-
-    def fails(*_: object, **__: object) -> None:
-        raise InputError("no more")
-
-    monkeypatch.setattr(stream, "answer_stream", fails)
-    monkeypatch.setattr(Responder, "close", lambda self: closed.append(self))
-    with Path(os.devnull).open() as nothing:
-        monkeypatch.setattr(sys, "stdin", nothing)
-        assert main(["recommend", str(trained.folder), "--stream"]) == 2
-    assert len(closed) == 1
 
 
 def test_a_reader_that_goes_away_ends_the_command_quietly(trained: TrainedPolicy) -> None:

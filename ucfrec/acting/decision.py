@@ -186,8 +186,10 @@ class DecisionRule:
         perturbed = logs - torch.log(-torch.log(noise))
         highest = perturbed.topk(k, dim=-1)
         items = highest.indices
-        by_score = scores.argsort(dim=-1, descending=True, stable=True)
-        if torch.isneginf(highest.values).any():
+        few_left = bool(torch.isneginf(highest.values).any())
+        if few_left or len(modes) > 1:
+            by_score = scores.argsort(dim=-1, descending=True, stable=True)
+        if few_left:
             places = perturbed.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
             items = by_score.gather(1, places)[:, :k]
         if len(modes) == 1:
@@ -221,12 +223,12 @@ class DecisionRule:
         return modes
 
 
-def _read_saved(value: Any) -> DecisionRule:
-    return value if isinstance(value, DecisionRule) else DecisionRule.from_dict(value, "the rule")
-
-
 SavedRule = Annotated[
-    DecisionRule, PlainValidator(_read_saved), PlainSerializer(DecisionRule.as_dict)
+    DecisionRule,
+    PlainValidator(
+        lambda v: v if isinstance(v, DecisionRule) else DecisionRule.from_dict(v, "the rule")
+    ),
+    PlainSerializer(DecisionRule.as_dict),
 ]
 """A rule as an entry of a record."""
 

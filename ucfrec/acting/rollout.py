@@ -185,20 +185,11 @@ def rollout(
             returns[episode[rows]] += rewards[rows]
             lengths[episode[rows]] += 1
             if on_step is not None:
-                users = info.get(USER_IDS)
-                step = Step(
-                    rows=rows,
-                    episodes=episode[rows],
-                    observations=observations[rows],
-                    actions=actions[rows],
-                    rewards=rewards[rows],
-                    next_observations=_undo_reset(next_observations, next_info)[rows],
-                    propensities=None if propensities is None else propensities[rows],
-                    terminated=terminated[rows],
-                    truncated=truncated[rows],
-                    user_ids=None if users is None else users[rows],
-                )
-                on_step(step)
+                after, users = _undo_reset(next_observations, next_info), info.get(USER_IDS)
+                columns = [episode, observations, actions, rewards, after]
+                columns += [propensities, terminated, truncated, users]
+                of_rows: Any = (None if column is None else column[rows] for column in columns)
+                on_step(Step(rows, *of_rows))
             ended = terminated | truncated
             actor.begin(np.flatnonzero(ended))
             bar.update(int((ended & live).sum()))

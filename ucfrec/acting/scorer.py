@@ -108,7 +108,9 @@ class Scorer:
         if reward_model is not None and bool(reward_model.binary):
             self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
         self._items = _ItemProduct(policy, reward_model, states)
-        self._engine: Callable[[Sessions, Tensor], Tensor] | None = None
+        self.engine: Callable[[Sessions, Tensor], Tensor] | None = None
+        """Computes the scores (1, n_items) of a single session, given what may not be shown, bool
+        of that size; None for torch."""
         self._require_parts()
 
     def under(self, rule: DecisionRule) -> "Scorer":
@@ -118,15 +120,8 @@ class Scorer:
             InputError: the rule needs what the run lacks.
         """
         scorer = copy.copy(self)
-        scorer.rule, scorer._engine = rule, None
+        scorer.rule, scorer.engine = rule, None
         scorer._require_parts()
-        return scorer
-
-    def answering_one_with(self, engine: Callable[[Sessions, Tensor], Tensor]) -> "Scorer":
-        """The same, but `engine` computes the scores (1, n_items) of a single session, given what
-        may not be shown, bool of that size."""
-        scorer = copy.copy(self)
-        scorer._engine = engine
         return scorer
 
     def _require_parts(self) -> None:
@@ -210,11 +205,9 @@ class Scorer:
         return replace(windows, returns_to_go=returns_to_go.masked_fill(~windows.mask, 0.0))
 
     @torch.no_grad()
-    def act(self, sessions: Sessions) -> Tensor:
+    def act(self, sessions: Sessions, windows: Windows | None = None) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        return self._act(self.windows(sessions))
-
-    def _act(self, windows: Windows) -> Tensor:
+        windows = self.windows(sessions) if windows is None else windows
         return self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
 
     @torch.no_grad()
@@ -234,7 +227,7 @@ class Scorer:
         if self.has_factors:
             features, policy = self._items.policy_part(windows, sessions.shown)
         else:
-            outputs = self._act(windows)
+            outputs = self.act(sessions, windows)
         # A view of several windows would keep all of their states.
         states = windows.states[:, -1].contiguous()
         model = self._items.model_part(sessions, states) if rewards else None
@@ -271,13 +264,13 @@ class Scorer:
         serving = sessions.states is None and self.is_product and not exporting
         # Policies and fits may keep tensors, which those of inference mode would spoil for them.
         with torch.inference_mode() if serving else torch.no_grad():
-            if self._engine is not None and len(sessions.users) == 1:
+            if self.engine is not None and len(sessions.users) == 1:
                 without = torch.zeros(1, self._items.count, dtype=torch.bool)
                 if left_out is not None:
                     without[left_out] = True
                 if excluded is not None:
                     without |= excluded
-                return _require_scores(self._engine(sessions, without), empty)
+                return _require_scores(self.engine(sessions, without), empty)
             return self.scores_of(self.query(sessions), left_out, excluded, empty=empty)
 
     @torch.no_grad()

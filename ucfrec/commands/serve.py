@@ -3,8 +3,9 @@
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -15,8 +16,6 @@ from ucfrec.processes import Interrupted
 
 if TYPE_CHECKING:
     import socket
-
-    import uvicorn
 
     from ucfrec.recommending.responder import Responder
     from ucfrec.recommending.server import Parent
@@ -59,20 +58,15 @@ class Serve(AnswerOptions):
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.server import (
-            PrintingServer,
-            Workers,
-            listening_socket,
-            ready_line,
-        )
+        from ucfrec.recommending.server import Workers, listening_socket, print_ready
 
         address = listening_socket(self.host, self.port)
         if self.workers == 1:
-            self._serve(address, PrintingServer)
+            self._serve(address)
             return
         with address as listening, Workers(self._work, listening) as workers:
             what = workers.start(self.workers)
-            print(ready_line(what, listening), flush=True)
+            print_ready(what, listening)
             try:
                 workers.keep()
             except Interrupted:
@@ -80,19 +74,13 @@ class Serve(AnswerOptions):
                 print(_STOPPED, file=sys.stderr)
 
     def _serve(
-        self,
-        address: "AbstractContextManager[socket.socket]",
-        make_server: "Callable[[uvicorn.Config, str], uvicorn.Server]",
+        self, address: "AbstractContextManager[socket.socket]", parent: "Parent | None" = None
     ) -> None:
-        """Answer requests in this process.
-
-        Args:
-            make_server: makes the server, given what it answers with.
-        """
+        """Answer requests in this process, which may have a parent of several."""
         import torch
 
         from ucfrec.recommending.responder import Served, parse_split
-        from ucfrec.recommending.server import server_config
+        from ucfrec.recommending.server import Server, print_ready, server_config
         from ucfrec.recommending.web import ServerLimits, application
         from ucfrec.runs.record import RUN, verify_run
 
@@ -127,9 +115,15 @@ class Serve(AnswerOptions):
                 timeout_graceful_shutdown=int(limits.timeout) + 1,
                 workers=self.workers,
             )
+            what = f"ucfrec serve: {served.trained!r}"
+            if parent is None:
+                server = Server(config, partial(print_ready, what))
+            else:
+                server = Server(config, lambda _: parent.report("ready", what))
+                parent.ends(server)
             with address as listening:
                 try:
-                    make_server(config, f"ucfrec serve: {served.trained!r}").run([listening])
+                    server.run([listening])
                 except Interrupted:
                     # What was asked of a server that is stopped is done.
                     if not several:
@@ -138,18 +132,12 @@ class Serve(AnswerOptions):
     def _work(self, listening: "socket.socket", parent: "Parent") -> None:
         """Answer requests in one of several processes."""
         from ucfrec.commands.cli import explanation, notes_on_one_line
-        from ucfrec.recommending.server import Server
-
-        def make_server(config: "uvicorn.Config", what: str) -> Server:
-            server = Server(config, lambda _: parent.report("ready", what))
-            parent.ends(server)
-            return server
 
         try:
             with notes_on_one_line("ucfrec serve"):
                 if not parent.first:
                     warnings.simplefilter("ignore", InputNote)
-                self._serve(listening, make_server)
+                self._serve(listening, parent)
         except Exception as error:
             why = explanation(error)
             if why is None:
@@ -189,7 +177,12 @@ class Explore(Table):
     def execute(self) -> None:
         """Show policies until Ctrl-C or TERM."""
         from ucfrec.exploring.page import Explorer, application
-        from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
+        from ucfrec.recommending.server import (
+            Server,
+            listening_socket,
+            print_ready,
+            server_config,
+        )
         from ucfrec.reporting.training import read_features
         from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -200,6 +193,6 @@ class Explore(Table):
         config = server_config(application(explorer, ("localhost", "127.0.0.1", "[::1]")))
         with listening_socket("127.0.0.1", self.port) as listening:
             try:
-                PrintingServer(config, "ucfrec explore", page="/").run([listening])
+                Server(config, partial(print_ready, "ucfrec explore", page="/")).run([listening])
             except Interrupted:
                 print("ucfrec explore: stopped", file=sys.stderr)

@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Container, Iterator, Mapping
 from functools import partial
+from hashlib import file_digest
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self
 
@@ -34,7 +35,6 @@ CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
 RUN_RECORD: Final = "run.json"
 """Record of a run."""
-_BLOCK: Final = 2**19
 _THREADS: Final = 2
 _LARGEST: Final = 2**48
 SMALL: Final = 2**26
@@ -49,12 +49,8 @@ Undefinable = Annotated[float, BeforeValidator(lambda value: math.nan if value i
 
 def file_checksum(path: Path) -> str:
     """XXH3 (64 bits, hexadecimal) of the content of a file."""
-    digest, block = xxhash.xxh3_64(), bytearray(_BLOCK)
-    view = memoryview(block)
     with path.open("rb", buffering=0) as file:
-        while size := file.readinto(block):
-            digest.update(view[:size])
-    return digest.hexdigest()
+        return file_digest(file, xxhash.xxh3_64).hexdigest()
 
 
 def _names(folder: Path) -> Iterator[str]:

@@ -7,6 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -92,7 +93,7 @@ def export(
     """
     _require_installed()
     graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
-    example = _draw_arguments(graph.scorer, 3, seed=0)
+    example = _draw_inputs(graph.scorer, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: list[dict[int, Any]] = [{0: batch} for _ in example]
     shapes[-1][1] = torch.export.Dim("excluded_items", min=1, max=2**24)
@@ -102,17 +103,12 @@ def export(
         write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
         runner = start_runner(path)
         for sessions in (_COMPARED, 1):
-            arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
-            results = _run_graph(runner, arguments)
-            with torch.no_grad():
-                expected = graph(*arguments.values())
-            # The scores, without the numbers of items.
-            pairs = zip(results[::2], expected[::2], strict=True)
-            size = measure_magnitude(graph.scorer)
-            difference = max(difference, require_close(pairs, _SERVE, size))
+            example = _draw_inputs(graph.scorer, sessions, seed=sessions)
+            difference = max(difference, _measure_difference(graph, runner, example, _SERVE))
         files = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
-        outputs = dict(zip(OUTPUTS, expected, strict=True))
-        description = _describe_graph(graph.scorer, trained, arguments, outputs)
+        with torch.no_grad():
+            outputs = dict(zip(OUTPUTS, graph(*example.values()), strict=True))
+        description = _describe_graph(graph.scorer, trained, example, outputs)
         write_json(scratch / DESCRIPTION, description | {"files": list(files)})
     return Exported(sum(files.values()), difference)
 
@@ -133,7 +129,7 @@ class _Network(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
         *session, excluded = inputs
-        return self.scorer.scores(Sessions(*session), excluded=excluded, empty=True)
+        return (self.scorer.scores(Sessions(*session), excluded=excluded, empty=True),)
 
 
 class RuleGraph(_Network):
@@ -166,7 +162,7 @@ class RuleGraph(_Network):
         places = torch.where(excluded < 0, self._items, excluded)
         nothing = torch.zeros(excluded.shape[0], self._items + 1, dtype=torch.bool)
         left_out = nothing.scatter(1, places, torch.ones_like(places, dtype=torch.bool))[:, :-1]
-        scores = super().forward(*session, left_out)
+        (scores,) = super().forward(*session, left_out)
         return scores, *find_best(scores, self._k)
 
 
@@ -190,26 +186,14 @@ class ScoreGraph:
     def __init__(self, scorer: Scorer, kind: str) -> None:
         _require_installed()
         network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
-        assert scorer.states is not None
-        items = len(scorer.states.embeddings)
-
-        def draw_example(seed: int) -> tuple[Sessions, Tensor]:
-            """A random session, and items that may not be shown."""
-            rng = np.random.default_rng(seed)
-            excluded = rng.random((1, items)) < rng.uniform(0, _MOST_EXCLUDED)
-            return _draw_sessions(scorer, 1, seed), torch.from_numpy(excluded)
-
-        session, excluded = draw_example(seed=0)
-        example = {**_name_inputs(session), _EXCLUDED: excluded}
+        example = _draw_inputs(scorer, 1, seed=0, mask=True)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / GRAPH
             write_graph(network, example, path, ["scores"], kind, _TORCH)
             self._runner = start_runner(path, threads=1)
-        size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
-            session, excluded = draw_example(seed=number)
-            expected = scorer.scores(session, excluded=excluded, empty=True)
-            require_close([(self(session, excluded).numpy(), expected)], _TORCH, size)
+            example = _draw_inputs(scorer, 1, seed=number, mask=True)
+            _measure_difference(network, self._runner, example, _TORCH)
 
     def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
         """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be
@@ -243,11 +227,13 @@ def _draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     )
 
 
-def _draw_arguments(scorer: Scorer, sessions: int, seed: int) -> dict[str, Tensor]:
-    """Random inputs of a `RuleGraph`, in the order of its arguments."""
+def _draw_inputs(scorer: Scorer, sessions: int, seed: int, mask: bool = False) -> dict[str, Tensor]:
+    """Random inputs of a graph; the items excluded are numbers, or a `mask` of all items."""
     assert scorer.states is not None
     n, rng = len(scorer.states.embeddings), np.random.default_rng(seed)
-    excluded = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    excluded: Array = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    if mask:
+        excluded = rng.random((sessions, n)) < rng.uniform(0, _MOST_EXCLUDED)
     inputs = _name_inputs(_draw_sessions(scorer, sessions, seed))
     return inputs | {_EXCLUDED: torch.from_numpy(excluded)}
 
@@ -271,6 +257,16 @@ def _run_graph(runner: Any, inputs: dict[str, Tensor]) -> list[Array]:
     arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
     outputs: list[Array] = runner.run(None, arrays)
     return outputs
+
+
+def _measure_difference(
+    network: _Network, runner: Any, inputs: dict[str, Tensor], remedy: str
+) -> float:
+    """`require_close` of the scores that a graph and its network give."""
+    with torch.no_grad():
+        expected = network(*inputs.values())[::2]  # without the numbers of items
+    pairs = zip(_run_graph(runner, inputs)[::2], expected, strict=True)
+    return require_close(pairs, remedy, measure_magnitude(network.scorer))
 
 
 def measure_magnitude(scorer: Scorer) -> float:
@@ -305,14 +301,9 @@ def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: floa
 
 
 def _require_installed() -> None:
-    try:
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"ONNX needs {error.name}, which is not installed; install ucfrec[export]"
-        ) from None
+    for name in ("onnx", "onnxruntime", "onnxscript"):
+        if find_spec(name) is None:
+            raise InputError(f"ONNX needs {name}, which is not installed; install ucfrec[export]")
 
 
 def write_graph(

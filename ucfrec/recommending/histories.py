@@ -109,23 +109,21 @@ def _read_plain(frame: pd.DataFrame, by_id: bool, duplicates: str) -> Histories 
     Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
     int64, and `reward`, a number; no row is out of range.
     """
-    if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
-        return None
-    names = {schema.USER_ID: "user", schema.ITEM_ID: schema.ITEM}
-    names |= {schema.TIMESTAMP: schema.TIMESTAMP}
+    names = {schema.USER_ID: "user", schema.ITEM_ID: schema.ITEM, schema.TIMESTAMP: "timestamp"}
     names |= {schema.SESSION_ID: "session"} if by_id else {}
-    if {*frame.columns} != {*names, schema.REWARD} or frame.shape[1] != len(names) + 1:
+    if not (
+        type(frame) is pd.DataFrame
+        and 0 < len(frame) <= _MOST_PLAIN_ROWS
+        and sorted(map(str, frame.columns)) == sorted([*names, schema.REWARD])
+        and all(frame[name].dtype == np.int64 for name in names)
+        and frame[schema.REWARD].dtype in (np.float64, np.float32, np.int64, np.bool_)
+    ):
         return None
     table = {short: frame[name].to_numpy() for name, short in names.items()}
-    if any(values.dtype != np.int64 for values in table.values()):
-        return None
-    if frame[schema.REWARD].dtype not in (np.float64, np.float32, np.int64, np.bool_):
-        return None
     rewards, times = frame[schema.REWARD].to_numpy(np.float64), table[schema.TIMESTAMP]
-    if times.min() < EARLIEST_MS or times.max() > time.time() * 1000:
-        return None
+    in_range = times.min() >= EARLIEST_MS and times.max() <= time.time() * 1000
     # A comparison with NaN is false too.
-    if not (np.abs(rewards) <= schema.LARGEST_REWARD).all():
+    if not (in_range and (np.abs(rewards) <= schema.LARGEST_REWARD).all()):
         return None
     table |= {schema.REWARD: rewards, "row": np.arange(len(frame))}
     order = choose_rows(table, duplicates)

@@ -212,7 +212,7 @@ class Chooser:
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
-    """Numbers (N,) of the items that may be recommended; InputError if the policy does not know
+    """Numbers (N,) of items that are named; InputError if the policy does not know
     some of them, or any with `skip_unknown`, which leaves those out."""
     numbers = index.numbers(ids)
     in_catalogue = numbers >= 0
@@ -220,7 +220,7 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
         unknown = ids[~in_catalogue].tolist()
         remedy = "name items of its catalogue" if skip_unknown else "leave them out"
         raise InputError(
-            f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
+            f"{len(unknown)} of {len(ids)} named items are not known to the policy "
             f"({name_some(unknown)}); {remedy}"
         )
     return numbers[in_catalogue]
@@ -232,10 +232,8 @@ def _refuse_unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError
         unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
         rows += len(unknown)
         items |= set(unknown.tolist())
-    have = "row has" if rows == 1 else "rows have"
-    count = "1 item" if len(items) == 1 else f"{len(items)} items"
     return InputError(
-        f"{rows} {have} an item_id that the policy does not know ({count}: "
+        f"{rows} rows have an item_id that the policy does not know ({len(items)} items: "
         f"{name_some(sorted(items))}); prepare and train on logs with them, or leave those rows "
         "out with --skip-unknown (skip_unknown=True in Python)"
     )
@@ -350,7 +348,23 @@ class ItemIndex:
             excluded: (n_items,) bool, what no user is recommended.
             k: at most the number of items.
         """
-        items, scores = self._search(sessions, left_out, excluded, k)
+        scorer, n_items = self._scorer, self._index.ntotal
+        query = scorer.query(sessions)
+        part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
+        factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
+        products, numbers = map(torch.from_numpy, self._index.search(factors, count))
+        # Of equal scores, the lowest number comes first.
+        numbers, order = numbers.sort()
+        candidates, missing = numbers.clamp(min=0), numbers < 0
+        if excluded is not None:
+            missing |= excluded[candidates]
+        # Pairs of a row and an item are single numbers.
+        rows = torch.arange(len(numbers)).unsqueeze(1) * n_items
+        missing |= torch.isin(rows + candidates, left_out[0] * n_items + left_out[1])
+        scores = scorer.scores_of_some(query, part, candidates, products.gather(1, order))
+        scores = scores.masked_fill(missing, -torch.inf)
+        best = best_items(scores, k)
+        items, scores = candidates.gather(1, best), scores.gather(1, best)
         short = torch.isneginf(scores[:, -1])
         sampled = torch.zeros(len(short), dtype=torch.bool)
         sampled[self._rng.choice(len(short), size=-(-len(short) // _SAMPLE), replace=False)] = True
@@ -358,7 +372,7 @@ class ItemIndex:
             items_out = left_out[1][left_out[0] == row]
             row_out = torch.zeros_like(items_out), items_out
             session = sessions.at(torch.tensor([row]))
-            exact = self._scorer.scores(session, row_out, excluded, empty=True)
+            exact = scorer.scores(session, row_out, excluded, empty=True)
             best = best_items(exact, k)[0]
             if short[row]:
                 items[row], scores[row] = best, exact[0, best]
@@ -369,32 +383,6 @@ class ItemIndex:
                 self.sampled += 1
         highest = scores[:, :1].masked_fill(torch.isneginf(scores[:, :1]), 0.0)
         return items, scores - highest
-
-    def _search(
-        self,
-        sessions: Sessions,
-        left_out: tuple[Tensor, Tensor],
-        excluded: Tensor | None,
-        k: int,
-    ) -> tuple[Tensor, Tensor]:
-        """The best k of the candidates and their scores, (B, k) each."""
-        scorer, n_items = self._scorer, self._index.ntotal
-        query = scorer.query(sessions)
-        part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
-        factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
-        products, numbers = map(torch.from_numpy, self._index.search(factors, count))
-        # Of equal scores, the lowest number comes first.
-        numbers, order = numbers.sort()
-        items, missing = numbers.clamp(min=0), numbers < 0
-        scores = scorer.scores_of_some(query, part, items, products.gather(1, order))
-        if excluded is not None:
-            missing |= excluded[items]
-        # Pairs of a row and an item are single numbers.
-        rows = torch.arange(len(items)).unsqueeze(1) * n_items
-        missing |= torch.isin(rows + items, left_out[0] * n_items + left_out[1])
-        scores = scores.masked_fill(missing, -torch.inf)
-        best = best_items(scores, k)
-        return items.gather(1, best), scores.gather(1, best)
 
 
 def similar_items(
@@ -423,13 +411,7 @@ def similar_items(
     if scorer.has_factors:
         vectors = torch.from_numpy(scorer.vectors()[:, :-1])
     vectors = F.normalize(vectors, dim=1)
-    all_numbers = trained.items.numbers(chosen)
-    if (all_numbers < 0).any():
-        unknown = chosen[all_numbers < 0]
-        raise InputError(
-            f"{len(unknown)} of {len(chosen)} items are not in the training data, such as "
-            f"{unknown[0]}; leave them out"
-        )
+    all_numbers = candidate_numbers(trained.items, chosen, skip_unknown=False)
     k = min(k, len(ids) - 1)
     frames = []
     for begin in range(0, len(all_numbers), _ITEMS_AT_ONCE):

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, NotRequired
 
@@ -50,8 +51,6 @@ _EARLIEST_MS: Final = 365 * DAY_MS
 _LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 _MOST_FAULTS: Final = 1000
 """Beyond this number, it would take too long to look at each."""
-_SHOWN: Final = 60
-"""Most characters of a wrong value in a message."""
 _TYPES: Final = ("constrained-str", "float", "constrained-int")
 """Last part of pydantic's place of an error in one of several types."""
 _ROWS: Final = "history"
@@ -155,9 +154,8 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
         "items (k)": (request.k or 1, limits.k),
         "rows of history": (len(request.history), limits.history),
         "candidates": (len(request.candidates or ()), limits.candidates),
+        "interactions": (len(getattr(request, "interactions", ())), limits.history),
     }
-    if isinstance(request, StreamRequest):
-        counts["interactions"] = (len(request.interactions), limits.history)
     for name, (count, most) in counts.items():
         if count > most:
             raise InputError(f"{count:,} {name}: the limit is {most:,}; request less")
@@ -177,9 +175,8 @@ def _describe(errors: Sequence[Any]) -> str:
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
     same = zip(errors, places, strict=True)
     messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
-    value = json.dumps(first.get("input"), default=str)
-    value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
-    actual = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
+    value = first.get("input")
+    actual = "" if isinstance(value, dict | list) else f", not {json.dumps(value, default=str):.60}"
     return (
         f"{where}: {' or '.join(messages)}{actual}"
         f"{f'; {more} more fault' + 's' * (more > 1) if more else ''}"
@@ -202,11 +199,12 @@ class RowRewards:
     def __init__(self, expression: Expression) -> None:
         self._expression, self._computed = expression, computes_with_reward(expression)
         self._stack = ExitStack()
-        self._connection: duckdb.DuckDBPyConnection | None = None
-
-    def close(self) -> None:
+        self.close = self._stack.close
         """Close the engine."""
-        self._stack.close()
+
+    @cached_property
+    def _connection(self) -> duckdb.DuckDBPyConnection:
+        return self._stack.enter_context(engine((), None, _MEMORY))
 
     def of_rows(self, rows: Sequence[Mapping[str, Any]]) -> list[float]:
         """Rewards (N,) of rows; InputError for one that is missing, not finite or too large."""
@@ -222,8 +220,6 @@ class RowRewards:
         return _require_numbers(self._evaluate(rows), "no reward")
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        if self._connection is None:
-            self._connection = self._stack.enter_context(engine((), None, _MEMORY))
         connection, source = self._connection, Path(_ROWS)
         names, columns = {name.casefold() for row in rows for name in row}, {}
         for name in columns_of(connection, self._expression):
@@ -241,23 +237,20 @@ class RowRewards:
                     f"history: {name} has values of several types ({reason})"
                 ) from None
         connection.register(_ROWS, pa.table(columns))
+        described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
+        table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
         try:
-            described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
-            table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
-            try:
-                with explain_errors(connection, (table,)):
-                    sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
-                    query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
-                    values = [row[0] for row in connection.sql(query).fetchall()]
-            except InputError:
-                # Its text names files of the server.
-                types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
-                raise InputError(
-                    f"history: the run's reward ({self._expression}) cannot be computed where "
-                    f"{types}; give values of the types that the training log has"
-                ) from None
-        finally:
-            connection.unregister(_ROWS)
+            with explain_errors(connection, (table,)):
+                sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
+                query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
+                values = [row[0] for row in connection.sql(query).fetchall()]
+        except InputError:
+            # Its text names files of the server.
+            types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
+            raise InputError(
+                f"history: the run's reward ({self._expression}) cannot be computed where "
+                f"{types}; give values of the types that the training log has"
+            ) from None
         if not (is_number(kind) or kind == "BOOLEAN"):
             raise InputError(f"history: the run's reward is {kind} here; give numbers")
         return values
@@ -323,12 +316,12 @@ class HistoryReader:
         }
         sessions = None
         if self.by_session_id:
-            for n, row in enumerate(rows):
-                if row.get("session_id") is None:
-                    raise InputError(
-                        f"history.{n} has no session_id, by which the run splits sessions"
-                    )
-            sessions = id_array([row["session_id"] for row in rows])
+            ids: list[Any] = [row.get("session_id") for row in rows]
+            if None in ids:
+                raise InputError(
+                    f"history.{ids.index(None)} has no session_id, by which the run splits sessions"
+                )
+            sessions = id_array(ids)
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
             observed = [row.get("observation") or () for row in rows]

@@ -75,10 +75,6 @@ class Mean(NamedTuple):
         """The mean; 0 if it is of nothing."""
         return self.total / self.weight if self.weight else 0.0
 
-    def with_more(self, total: float, weight: float) -> "Mean":
-        """The mean with more of its values."""
-        return Mean(self.total + total, self.weight + weight)
-
 
 def exact_id(value: int | str) -> int | str:
     """An identifier for JSON: as text if a client that reads numbers as doubles would round it."""
@@ -127,19 +123,16 @@ class Responder:
         scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
-        if engine not in (TORCH, ONNXRUNTIME):
-            raise InputError(f"the engine is {engine!r}; give {TORCH} or {ONNXRUNTIME}")
         if engine == ONNXRUNTIME:
             from ucfrec.recommending.export import ScoreGraph
 
-            scorer = scorer.answering_one_with(ScoreGraph(scorer, trained.name))
+            scorer.engine = ScoreGraph(scorer, trained.name)
         self.trained, self.limits, self.rule = trained, limits, scorer.rule
         self._chooser = Chooser(trained, scorer, seed)
         self._k, self._filter_seen, self._skip_unknown = k, filter_seen, skip_unknown
         self._source = trained.fingerprint, self.rule.hash
         self._reader = HistoryReader.of(trained)
-        self._busy = threading.Lock()
-        self._unknown_users, self._unknown_items = Mean(0, 0), Mean(0, 0)
+        self._unknown = {"unknown_items": Mean(0, 0), "unknown_users": Mean(0, 0)}
 
     def drift(self) -> dict[str, Mean]:
         """Share of unknown items among rows of histories, and of unknown users among requests, so
@@ -147,8 +140,11 @@ class Responder:
         update = self.trained.record.update
         drift = (update and update.drift) or {}
         means = {f"update_{name}": Mean(float(value), 1.0) for name, value in drift.items()}
-        unknown = {"unknown_items": self._unknown_items, "unknown_users": self._unknown_users}
-        return means | unknown
+        return means | self._unknown
+
+    def _count_unknown(self, what: str, count: int, of: int) -> None:
+        total, weight = self._unknown[what]
+        self._unknown[what] = Mean(total + count, weight + of)
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""
@@ -166,14 +162,12 @@ class Responder:
     def answers(self, requests: Sequence[Request]) -> list[Answer | InputError]:
         """Answer requests with as few forward passes as memory allows: to each, in their order, the
         answer, or what is wrong with it."""
-        with self._busy:
-            outcomes = [self._read_or_refuse(request) for request in requests]
-            questions = [question for question in outcomes if isinstance(question, _Question)]
-            answers = self._answer(questions) if questions else iter(())
-            return [
-                outcome if isinstance(outcome, InputError) else next(answers)
-                for outcome in outcomes
-            ]
+        outcomes = [self._read_or_refuse(request) for request in requests]
+        questions = [question for question in outcomes if isinstance(question, _Question)]
+        answers = self._answer(questions) if questions else iter(())
+        return [
+            outcome if isinstance(outcome, InputError) else next(answers) for outcome in outcomes
+        ]
 
     def _read_or_refuse(self, request: Request) -> _Question | InputError:
         items, candidates = self.trained.items, None
@@ -182,7 +176,7 @@ class Responder:
             numbered = history.with_numbers(items, self._filter_seen)
             unknown = numbered.item_ids < 0
             count, rows = int(unknown.sum()), len(unknown)
-            self._unknown_items = self._unknown_items.with_more(count, rows)
+            self._count_unknown("unknown_items", count, rows)
             if count and not self._skip_unknown:
                 names = name_some(sorted(set(history.item_ids[unknown].tolist())))
                 raise InputError(
@@ -200,7 +194,7 @@ class Responder:
     def _answer(self, questions: Sequence[_Question]) -> Iterator[Answer]:
         histories = Histories.joined([question.history for question in questions])
         unknown = int((self.trained.users.numbers(histories.users) < 0).sum())
-        self._unknown_users = self._unknown_users.with_more(unknown, len(questions))
+        self._count_unknown("unknown_users", unknown, len(questions))
         numbers, scores, propensities = self._chooser.choose(
             histories,
             np.asarray([question.request_id for question in questions], dtype=object),
@@ -300,15 +294,12 @@ class Served:
                 return self._arms[0].responder.answers(requests)
             shares = [arm.share for arm in self._arms]
             places = [arm_of(request.user_id, shares) for request in requests]
-            answers: dict[int, Answer | InputError] = {}
-            for number in set(places):
-                rows, arm = [n for n, p in enumerate(places) if p == number], self._arms[number]
-                outcomes = arm.responder.answers([requests[row] for row in rows])
-                for row, outcome in zip(rows, outcomes, strict=True):
-                    if isinstance(outcome, Answer):
-                        outcome = outcome._replace(arm=arm.name)
-                    answers[row] = outcome
-            return [answers[row] for row in range(len(requests))]
+            outcomes = []
+            for number, arm in enumerate(self._arms):
+                of_arm = [r for r, place in zip(requests, places, strict=True) if place == number]
+                outcomes.append(iter(arm.responder.answers(of_arm)))
+            answers = ((self._arms[place].name, next(outcomes[place])) for place in places)
+            return [a._replace(arm=name) if isinstance(a, Answer) else a for name, a in answers]
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""

@@ -141,11 +141,11 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         yield bound
 
 
-def ready_line(what: str, listening: socket.socket, page: str = "/docs") -> str:
-    """What is printed on stdout when a server is ready."""
+def print_ready(what: str, listening: socket.socket, page: str = "/docs") -> None:
+    """Say on stdout that a server is ready, and where."""
     host, port = listening.getsockname()[:2]
     where = f"[{host}]" if ":" in host else host
-    return f"{what}, ready at http://{where}:{port} (page: {page})"
+    print(f"{what}, ready at http://{where}:{port} (page: {page})", flush=True)
 
 
 class Server(uvicorn.Server):
@@ -161,13 +161,6 @@ class Server(uvicorn.Server):
         for bound in sockets or []:
             bound.listen(_BACKLOG)
             self._ready(bound)
-
-
-class PrintingServer(Server):
-    """A server that says on stdout when it is ready, and where."""
-
-    def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
-        super().__init__(config, lambda at: print(ready_line(what, at, page), flush=True))
 
 
 class Parent:

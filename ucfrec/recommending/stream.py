@@ -58,25 +58,25 @@ def _answer(
 ) -> Iterator[dict[str, Any]]:
     """The answers to lines."""
     waiting: list[_Read] = []
-    users: set[str] = set()
+    users: set[str | int] = set()
     for number, line in lines:
         request = _parse_line(line, responder.limits)
-        user = None if isinstance(request, InputError) else str(request.user_id)
+        user = number if isinstance(request, InputError) else str(request.user_id)
         # Whether rows are remembered is known once they have been answered.
         if user in users or len(waiting) == _AT_ONCE:
             yield from _answer_together(responder, remembered, waiting, exposures)
             waiting, users = [], set()
         waiting.append((number, request))
-        users |= set() if user is None else {user}
+        users.add(user)
     yield from _answer_together(responder, remembered, waiting, exposures)
 
 
 def _parse_line(line: bytes | None, limits: Limits) -> StreamRequest | InputError:
-    if line is None:
-        return InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
-    if not line.strip():
-        return InputError("the line is blank; send a request on each line")
     try:
+        if line is None:
+            raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
+        if not line.strip():
+            raise InputError("the line is blank; send a request on each line")
         request: StreamRequest = parse(StreamRequest, line, limits)
     except InputError as error:
         return error

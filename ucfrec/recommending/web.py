@@ -140,7 +140,6 @@ class _Metrics:
         )
         self._totals = Gauge(_DRIFT, text, ["measure"], **live)
         self._weights = Gauge(_WEIGHT, text, ["measure"], **live)
-        self._drift: dict[str, Mean] = {}
         self._used, self._cpu = 0.0, None
         if shared:
             self._collector = MultiProcessCollector(None)  # type: ignore[no-untyped-call]
@@ -185,11 +184,10 @@ class _Metrics:
 
     def _update(self) -> None:
         """Bring up to date what nothing else reports."""
-        previous, self._drift = self._drift, dict(self._measure_drift())
+        self._drift = self._measure_drift()
         for name, mean in self._drift.items():
-            if previous.get(name) != mean:
-                self._totals.labels(name).set(mean.total)
-                self._weights.labels(name).set(mean.weight)
+            self._totals.labels(name).set(mean.total)
+            self._weights.labels(name).set(mean.weight)
         if self._cpu is not None:
             seconds, self._used = self._used, time.process_time()
             self._cpu.inc(self._used - seconds)
@@ -394,15 +392,11 @@ async def _answer_http(
 
 async def _read_body(http: HTTPRequest, most: int) -> bytes:
     """The body of a request, of which no more than `most` bytes are read."""
-    too_large = HTTPException(413, f"the body has more than {most:,} bytes; send fewer rows")
-    stated = http.headers.get("content-length", "")
-    if stated.isdecimal() and int(stated[:20]) > most:
-        raise too_large
     body = bytearray()
     async for chunk in http.stream():
         body += chunk
         if len(body) > most:
-            raise too_large
+            raise HTTPException(413, f"the body has more than {most:,} bytes; send fewer rows")
     return bytes(body)
 
 

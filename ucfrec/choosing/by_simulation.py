@@ -353,7 +353,7 @@ class RuleSearch:
             doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
         if report is not None and abs(report.optimism) > max(_FAR_OFF, report.optimism_error):
             doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
-        weighted = training is not None and training.report.weighted
+        weighted = training is not None and training[1].weighted
         if not (weighted if report is None else report.weighted):
             some = schema.PROPENSITY in self.problem.train.record.columns
             lack = "some rows of the log have" if some else "the log has"

@@ -17,7 +17,11 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import TrainingUsers, fit_item_reward_model, fit_training_users
+from ucfrec.user_model.reward_fit import (
+    TrainingUsersReport,
+    fit_item_reward_model,
+    fit_training_users,
+)
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
 from ucfrec.user_model.session_end import (
     SESSIONS,
@@ -44,7 +48,7 @@ class UserModel:
     reward: ItemRewardModel
     """Expected reward of every item, as acting knows it."""
     reward_report: ItemRewardReport
-    training_users: TrainingUsers | None
+    training_users: tuple[ItemRewardModel, TrainingUsersReport] | None
     """Who reward what simulated sessions show; None where no sessions are simulated."""
     calibration: tuple[float, float]
     """Slope and intercept of the scores that rewards are drawn from, on held-out rows."""
@@ -88,9 +92,9 @@ class UserModel:
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line = users.report.calibration if users else (1.0, 0.0)
+            line = users[1].calibration if users else (1.0, 0.0)
             if users is None or not report.new_users:
-                model = users.model if users else reward
+                model = users[0] if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
             fitted: dict[str, Any] = {
@@ -119,7 +123,7 @@ class UserModel:
     @property
     def rewarding(self) -> ItemRewardModel:
         """The model that rewards of simulated sessions are drawn from."""
-        return self.reward if self.training_users is None else self.training_users.model
+        return self.reward if self.training_users is None else self.training_users[0]
 
     def expect(
         self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor

@@ -4,7 +4,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -23,11 +22,6 @@ from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import SHARE, warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, measure_drift
-
-_COUNTS: Final = (
-    *("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps"),
-    "expired_steps",
-)
 
 
 @dataclass(frozen=True)
@@ -108,7 +102,7 @@ def update_run(
         run=trained.fingerprint,
         settings_from_nothing=asdict(full),
         episodes=counts["episodes"],
-        appended={name: counts[name] for name in _COUNTS}
+        appended={name: count for name, count in counts.items() if type(count) is int}
         | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
     entries = {"update": update, "dropped_observations": trained.record.dropped_observations}

@@ -19,7 +19,6 @@ from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.runs.run import training_views
 from ucfrec.user_model.reward import LAGS, ItemRewardModel
 from ucfrec.user_model.reward_fit import (
-    draw_sessions,
     fit_item_reward_model,
     fit_training_users,
     reward_model_sizes,
@@ -150,13 +149,6 @@ def test_weights_add_up_to_a_users_effective_number_of_steps(
     columns["propensity"] = np.where(np.arange(8) == 3, np.nan, logged)
     view = EpisodeStore.from_arrays(columns, np.array([3, 4, 1]), {"user": users}, states)
     assert weigh_by_propensity(view, *view.all_steps(), items) is None
-
-
-def test_sessions_are_drawn_by_the_seed() -> None:
-    train, _ = log_of_tastes()
-    first, again, other = (draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1))
-    assert [*first] == [*again] != [*other]
-    assert sorted(first) == sorted(train.episode_values("user"))
 
 
 MANY_USERS, FEW_STEPS = 300, 20

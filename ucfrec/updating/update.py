@@ -19,7 +19,7 @@ from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import drop_columns
-from ucfrec.runs.start import SHARE, warm_settings
+from ucfrec.runs.start import warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, measure_drift
 
@@ -30,8 +30,6 @@ class UpdateOptions:
 
     append: AppendOptions = field(default_factory=AppendOptions)
     """How the store grows."""
-    share: float = SHARE
-    """Steps of the training, as a share of those of a training from scratch."""
     seed: int | None = None
     """Of everything random; None for that of the run."""
     refit: bool = True
@@ -95,7 +93,7 @@ def update_run(
         # In place of the settings of the rule's choice, it has the rule.
         settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
-    config, seed = warm_settings(full, options.share), options.seed
+    config, seed = warm_settings(full), options.seed
     config = replace(config, seed=config.seed if seed is None else seed)
     update = Update(
         of=run.resolve().name,

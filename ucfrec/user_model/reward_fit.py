@@ -146,7 +146,6 @@ def refit_item_reward_model(
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
-    search.kept = dict(begin.spreads)
     if report.new_users:
         search.kept = {name: begin.spreads[name] for name in LASTING if name in begin.spreads}
         search.fit_to(design)
@@ -154,7 +153,7 @@ def refit_item_reward_model(
         if "tastes" in begin.spreads:
             search.sessions = model, rows.history, rows.history
             search.set_tastes(tensors["tastes.root"])
-        search.kept = dict(begin.spreads)
+    search.kept = begin.spreads
     search.fit_to(search.design)
     model.set_effects(search.effects, search.design.sum_content)
     save_fit(folder / FITTED, model, search.effects, report)

@@ -84,16 +84,16 @@ class UserModel:
         if not path.exists():
             fatigue = calibration = None
             if reward.binary:
-                first_runs = LoggedRuns.of(train, tags, reward.lags, _MOST_STEPS)
-                later_runs = LoggedRuns.of(validation, tags, reward.lags, _MOST_STEPS)
-                fatigue = fit_fatigue(first_runs, later_runs)
+                views, lags = (train, validation), reward.lags
+                fatigue = fit_fatigue(*(LoggedRuns.of(v, tags, lags, _MOST_STEPS) for v in views))
             logged, held_out = (
                 LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line = users[1].calibration if users else (1.0, 0.0)
-            if users is None or not report.new_users:
+            if users is not None and report.new_users:
+                line = users[1].calibration
+            else:
                 model = users[0] if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line

@@ -171,9 +171,9 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
-        of_weights = {each.rule.reward_weight: each for each in ranked}
-        nearest = min((each for each in of_weights if each > weight), default=weight)
-        if of_weights[nearest].overlaps:
+        by_weight = {candidate.rule.reward_weight: candidate for candidate in ranked}
+        nearest = min((other for other in by_weight if other > weight), default=weight)
+        if by_weight[nearest].overlaps:
             break
         best = rank([(weight + nearest) / 2])
     warning = "; WARNING: no candidate does, this one is among those with the most hits"

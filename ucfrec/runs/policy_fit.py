@@ -127,17 +127,17 @@ def _fit_once(
     solve()
     module.eval()
     with torch.no_grad():
-        loss = math.nan if validate is None else validate()
-    if validate is not None and not math.isfinite(loss):
+        logged = {} if validate is None else {"validation_loss": validate()}
+    loss = logged.get("validation_loss", math.nan)
+    if logged and not math.isfinite(loss):
         raise InputError(f"{describe}: the validation loss is {loss}; look for extreme values")
     seconds = time.perf_counter() - start
-    logged = {} if validate is None else {"validation_loss": loss}
     log = MetricsLog(folder, 0)
     log.add(1, logged)
     log.close()
     metadata = {"step": 1, "best_step": 1, "best_validation": loss, "seconds": seconds}
     save_tensors(folder / "best.safetensors", module.state_dict(), metadata)
     save_tensors(last, module.state_dict(), metadata)
-    if callbacks.on_validation is not None and distributed.leads():
+    if callbacks.on_validation is not None:
         callbacks.on_validation(1, logged)
     return Fit(1, 1, loss, seconds)

@@ -74,14 +74,11 @@ def train_screened(
         find = screen or screen_store
         with TemporaryDirectory() as scratch:  # made once for runs that share stages
             file = Path(scratch) / "screening.json"
-            share_stage(
-                shared,
-                inputs,
-                find.__module__,
-                file.parent,
-                (file.name,),
-                lambda: write_json(file, asdict(find(store, SEED))),
-            )
+
+            def make() -> None:
+                write_json(file, asdict(find(store, SEED)))
+
+            share_stage(shared, inputs, find.__module__, file.parent, (file.name,), make)
             screening = Screening.model_validate({"how": how, **read_json(file)})
     flagged = screening.flagged
     if len(flagged) == store.state_size:

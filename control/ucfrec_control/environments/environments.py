@@ -103,7 +103,10 @@ def environment_of_data(dataset: Mapping[str, Any]) -> str:
     """
     name, env_id = dataset["dataset"], dataset["env_id"]
     if env_id is None:
-        raise InputError(f"the data of {name} does not name its environment; give it with --env")
+        raise InputError(
+            f"the data of {name} does not name its environment; give it with --env of "
+            "`evaluate`, or prepare the data with it"
+        )
     module, separator, _ = str(env_id).partition(":")
     if separator:
         raise InputError(

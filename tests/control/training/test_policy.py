@@ -42,9 +42,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     file = write_hdf5(made / "pendulum.hdf5", arrays, env_id="Pendulum-v1")
     control("prepare", file, "--out", made / "store")
-    for policy in ("ucf", "bc"):
-        where = (made / "store", "--out", made / policy, "--policy", policy)
-        said = control("train", *where, *set_options(TINY if policy == "ucf" else TINY[:3]))[0]
+    for name, policy, settings in (
+        ("ucf", "ucf", TINY),
+        ("bc", "bc", TINY[:3]),
+        ("best", "dt", (*TINY, "policy.max_return=true")),
+    ):
+        where = (made / "store", "--out", made / name, "--policy", policy)
+        said = control("train", *where, *set_options(settings))[0]
         returns = np.add.reduceat(arrays["rewards"], np.arange(0, 960, 40))
         assert f"behaviour     mean return {returns.mean():.4g} of 24" in said
         assert f"best quarter  mean return {np.sort(returns)[-6:].mean():.4g} of 6" in said
@@ -67,7 +71,7 @@ def play(policy: ControlPolicy, steps: int) -> tuple[Steps, Steps, list[float]]:
     return observations, actions, rewards
 
 
-@pytest.mark.parametrize("name", ["ucf", "bc"])
+@pytest.mark.parametrize("name", ["ucf", "bc", "best"])
 def test_onnxruntime_acts_as_python_does(folder: Path, tmp_path: Path, name: str) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs ucfrec[export]")
     control("export", folder / name, "--out", tmp_path / "graph")

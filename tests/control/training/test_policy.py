@@ -71,7 +71,7 @@ def play(policy: ControlPolicy, steps: int) -> tuple[Steps, Steps, list[float]]:
     return observations, actions, rewards
 
 
-@pytest.mark.parametrize("name", ["ucf", "bc", "best"])
+@pytest.mark.parametrize("name", ["ucf", "bc", pytest.param("best", marks=pytest.mark.slow)])
 def test_onnxruntime_acts_as_python_does(folder: Path, tmp_path: Path, name: str) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs ucfrec[export]")
     control("export", folder / name, "--out", tmp_path / "graph")

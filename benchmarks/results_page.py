@@ -442,7 +442,7 @@ CONTROL = "ucfrec-control benchmark --data $UCFREC_DATA/control --budget small -
 IN_TAG = "(in the git tag `benchmarks-2026-11`)"
 SECTIONS = (
     Section(
-        "Recommendation (Table 2)",
+        "Recommendation",
         "A method's name stands for it as published, `+shared` for it with the components that UCF "
         "has as well: exposure features, and a decision rule with a reward weight, selected on the "
         "log. Bold is the highest mean of a column among policies that "
@@ -503,7 +503,7 @@ SECTIONS = (
         distractor,
     ),
     Section(
-        "Control (Tables 1 and 3)",
+        "Control",
         "Normalised scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
         "of the authors' training (IQL: 50,000 in batches of 64, CQL: 10,000). Learning rates were "
         "chosen on validation loss by one search for all methods. Without a standard error there "
@@ -577,7 +577,7 @@ SECTIONS = (
         scores,
     ),
     Section(
-        "Control: the cost of a distractor (Figures 3 and 4)",
+        "Control: the cost of a distractor",
         "Policies trained with a distractor in their states and evaluated with it fixed to 0, and "
         "the same policies with it fixed to 1. Dropping what screening flags costs nothing.",
         "`ucfrec-control robustness --data $UCFREC_DATA/control --budget small`",

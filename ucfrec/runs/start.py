@@ -195,7 +195,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
             policy.head.exposure.start_from(train.item_states, scaled)
     else:
         actions = train.column(schema.ACTION)
-        policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
+        policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1e-6))
     policy.start_from(train)
     return policy
 

@@ -34,13 +34,13 @@ class Evaluate(Table):
     """Of the episodes."""
     target: Annotated[Sequence[float | None], target_given] = ()
     """Target return, or max for the largest that the policy expects in each state; repeatable
-    (default: the preset's)"""
+    (default: the preset's, else the largest of the training)"""
     checkpoint: Literal["both", "best", "last", "return"] = "both"
     """Weights to evaluate."""
     distractor: float = 0.0
     """Value that distractors are fixed to."""
     reference: Annotated[tuple[float, float] | None, "LOW HIGH"] = None
-    """Returns that score 0 and 100 (default: D4RL's for its tasks; without them, returns alone)"""
+    """Returns that score 0 and 100 (default: D4RL's for its tasks, none for others)"""
     video: Annotated[Path | None, "MP4"] = None
     """Record an episode: FILE.mp4, or folder for frames."""
     json: Path | None = None

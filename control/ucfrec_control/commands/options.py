@@ -19,7 +19,6 @@ from ucfrec_control.benchmark.plan import set_contexts
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.environments.environments import note_unknown
 from ucfrec_control.environments.scores import find_task
 
 MAX_RETURN: Final = "max"
@@ -72,8 +71,6 @@ class SourceOptions(Table):
             InputError: it is missing, damaged, of another format, or of other sizes than `--env`
                 has.
         """
-        if self.env is not None:
-            note_unknown(self.env)
         if is_minari(self.source):
             return read_minari(self.source, self.env, self.download)
         return read_d4rl(Path(self.source), self.env)

@@ -18,7 +18,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.arrays import Array, Float32Array
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError
 from ucfrec_control.environments.scores import D4RL_ANTMAZE, find_task
 
 SIDE_BY_SIDE = 50
@@ -94,26 +94,6 @@ def make_env(
         ) from None
 
 
-def note_unknown(env_id: str) -> None:
-    """Note that Gymnasium has no such environment here, if so.
-
-    AntMazes, and environments of a module that the name begins with, are only registered where they
-    are made.
-    """
-    if ":" in env_id or is_antmaze(env_id):
-        return
-    try:
-        gymnasium.spec(env_id)
-    except gymnasium.error.Error as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
-        warnings.warn(
-            f"--env {env_id}: Gymnasium has no such environment here ({reason}); check the name, "
-            "`ucfrec-control evaluate` needs one that it has",
-            InputNote,
-            stacklevel=2,
-        )
-
-
 def environment_of_data(dataset: Mapping[str, Any]) -> str:
     """The environment that a dataset names, of which `dataset` is the `source` of its store.
 
@@ -123,7 +103,10 @@ def environment_of_data(dataset: Mapping[str, Any]) -> str:
     """
     name, env_id = dataset["dataset"], dataset["env_id"]
     if env_id is None:
-        raise InputError(f"the data of {name} does not name its environment; give it with --env")
+        raise InputError(
+            f"the data of {name} does not name its environment; give it with --env of "
+            "`evaluate`, or prepare the data with it"
+        )
     module, separator, _ = str(env_id).partition(":")
     if separator:
         raise InputError(

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
@@ -22,7 +23,7 @@ _MEANINGS: Final = {
     "rewards": "of the same steps; the last one is not read",
     "steps": "number of steps that the episode has had",
     "target_return": "return that the rest of the episode shall have: the target less the rewards "
-    "so far, or where `target_per_step` is true, the target itself; not read by bc",
+    "so far, or where `target_per_step` is true, the target itself",
 }
 _REMEDY: Final = "use ucfrec_control.ControlPolicy"
 _COMPARED: Final = 64
@@ -32,8 +33,9 @@ _COMPARED: Final = 64
 class WindowGraph(nn.Module):
     """The next action from the last K steps of an episode."""
 
-    def __init__(self, trained: TrainedPolicy) -> None:
+    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None) -> None:
         super().__init__()
+        self.expects_best = rule is not None and rule.target is None
         record = trained.record
         self.policy, self.returns = trained.policy, record.return_to_go
         observed = np.arange(trained.logged_observation_size)
@@ -54,6 +56,8 @@ class WindowGraph(nn.Module):
         numbers = steps.unsqueeze(1) + torch.arange(1 - observations.shape[1], 1)
         states = observations.index_select(2, self.get_buffer("seen"))
         windows = Windows.of(numbers, states, actions, rewards)
+        if self.expects_best:
+            target_return = self.policy.max_return(windows)
         returns_to_go = self.returns.before(target_return, windows.rewards)
         returns_to_go = returns_to_go.masked_fill(~windows.mask, 0.0)
         return self.policy.act(replace(windows, returns_to_go=returns_to_go))
@@ -72,7 +76,8 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
     trained = load_run(run, checkpoint)
     if not isinstance(trained, TrainedPolicy):
         raise InputError(f"{run} is of IQL or CQL; export it with d3rlpy, or {_REMEDY}")
-    (rule, *_), graph = rules_of(trained, None), WindowGraph(trained).eval()
+    (rule, *_) = rules_of(trained, None)
+    graph = WindowGraph(trained, rule).eval()
     arguments, batch = _draw_windows(graph, trained, 3), torch.export.Dim("batch", min=1, max=2**20)
     with atomic_folder(out) as scratch:
         dynamic = {name: {0: batch} for name in arguments}

@@ -56,7 +56,8 @@ def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeSt
     if isinstance(trained, RLPolicy):
         return trained.act(store.column(schema.OBSERVATION), np.ones(store.n_steps, dtype=bool))[0]
     scorer, parts = trained.scorer(rule), []
-    for episodes, steps in store.step_batches():
+    for first in range(0, store.n_steps, _BATCH):
+        episodes, steps = store.locate(np.arange(first, min(first + _BATCH, store.n_steps)))
         logged = store.windows(episodes, steps, trained.policy.config.context)
         sessions = Sessions(
             logged.actions[:, :-1],
@@ -73,7 +74,7 @@ def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeSt
 def estimate(
     trained: Trained, rule: DecisionRule | None, store: EpisodeStore, discount: float = 0.99
 ) -> Estimate:
-    """Estimate the discounted return of a policy from the store that it was trained on.
+    """Estimate the discounted return of a policy from trajectories of the same robot.
 
     Of trajectories that the step limit ended, the last step is not regressed, because the state
     after it is unknown; the behaviour's return goes on with the estimate there.
@@ -87,8 +88,9 @@ def estimate(
     sizes = trained.record.sizes
     dropped = trained.record.dropped_observations
     expected = (sizes["state"] + len(dropped), sizes["action"])
-    stored = (store.observation_size, *store.record.columns[schema.ACTION])
-    if store.has_items or stored != expected:
+    actions = () if store.has_items else store.record.columns[schema.ACTION]
+    stored = (store.observation_size, *actions)
+    if stored != expected:
         raise InputError(
             f"{store.path}: observations and actions have sizes {stored}, the policy was trained "
             f"on {expected}; name a store of the same robot"

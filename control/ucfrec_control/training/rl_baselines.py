@@ -34,8 +34,6 @@ ALGORITHMS = ("iql", "cql")
 CHECKPOINT_EVERY = 5000
 """Steps between checkpoints and log lines."""
 _ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
-_LOWEST_GAP = -200.0
-"""Least conservative term of a step in AntMaze."""
 _HOPPER_NARROW = ("medium", "medium-replay", "mixed")
 
 
@@ -306,10 +304,6 @@ def _algorithm(config: RLConfig, device: str = "cpu:0") -> Any:
     d3rlpy = _d3rlpy()
     if config.algorithm == "iql":
         return _iql(d3rlpy, config).create(device=device)
-    if config.task == "antmaze":
-        from ucfrec_control.training.clipped_cql import ClippedCQL
-
-        return ClippedCQL(_cql(d3rlpy, config), device, _LOWEST_GAP)
     return _cql(d3rlpy, config).create(device=device)
 
 

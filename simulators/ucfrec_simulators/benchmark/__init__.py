@@ -1,1 +1,1 @@
-"""The recommendation benchmark: Table 2 of the paper, ablations, sweeps and a distractor."""
+"""The recommendation benchmark: methods of the paper's Table 2, ablations, sweeps, a distractor."""

@@ -10,8 +10,8 @@ from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import TASKS
 
 BENCHMARK: Final = Benchmark(
-    summary="Table 2 of the paper with built-in policies, ablations, shared components, sweeps of "
-    "UCF, a distractor",
+    summary="the methods of the paper's Table 2 with built-in policies, ablations, shared "
+    "components, sweeps of UCF, a distractor",
     tables={
         "main": Shown("Methods", method_table),
         "shared": Shown("Shared components, one by one", method_table),

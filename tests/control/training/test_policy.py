@@ -11,9 +11,14 @@ import pytest
 
 from tests.support.control_files import TINY, control, refused, set_options, write_hdf5
 from tests.support.markdown import ROOT
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.results.rows import read_results
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.start import new_policy
 from ucfrec_control import ControlPolicy
+from ucfrec_control.data.trajectories import Trajectories
 
 EPISODES = ("--episodes", 2, "--checkpoint", "last")
 
@@ -37,9 +42,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     file = write_hdf5(made / "pendulum.hdf5", arrays, env_id="Pendulum-v1")
     control("prepare", file, "--out", made / "store")
-    for policy in ("ucf", "bc"):
-        where = (made / "store", "--out", made / policy, "--policy", policy)
-        said = control("train", *where, *set_options(TINY if policy == "ucf" else TINY[:3]))[0]
+    for name, policy, settings in (
+        ("ucf", "ucf", TINY),
+        ("bc", "bc", TINY[:3]),
+        ("best", "dt", (*TINY, "policy.max_return=true")),
+    ):
+        where = (made / "store", "--out", made / name, "--policy", policy)
+        said = control("train", *where, *set_options(settings))[0]
         returns = np.add.reduceat(arrays["rewards"], np.arange(0, 960, 40))
         assert f"behaviour     mean return {returns.mean():.4g} of 24" in said
         assert f"best quarter  mean return {np.sort(returns)[-6:].mean():.4g} of 6" in said
@@ -62,7 +71,7 @@ def play(policy: ControlPolicy, steps: int) -> tuple[Steps, Steps, list[float]]:
     return observations, actions, rewards
 
 
-@pytest.mark.parametrize("name", ["ucf", "bc"])
+@pytest.mark.parametrize("name", ["ucf", "bc", pytest.param("best", marks=pytest.mark.slow)])
 def test_onnxruntime_acts_as_python_does(folder: Path, tmp_path: Path, name: str) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs ucfrec[export]")
     control("export", folder / name, "--out", tmp_path / "graph")
@@ -129,3 +138,23 @@ def test_the_return_is_estimated_with_reasons_against_it(folder: Path) -> None:
     assert "do not rely on the estimate: the policy's actions are far" in said
     assert re.search(r"policy +-\d+.*\[-.*\nbehaviour +-\d+", said)
     assert "discount is 1" in refused("ope", folder / "run", folder / "store", "--discount", 1)
+
+
+def test_the_unit_of_the_actions_does_not_matter(folder: Path, tmp_path: Path) -> None:
+    store = EpisodeStore.open(folder / "store")
+    source = {"where": "here", "dataset": "small", "env_id": None, "versions": {}}
+    small = Trajectories(
+        store.column(schema.OBSERVATION),
+        store.column(schema.ACTION) / 1000,
+        store.column(schema.REWARD),
+        store.lengths,
+        store.terminated.astype(bool),
+        None,
+        source,
+    ).write_store(tmp_path / "store")
+    losses = []
+    for data in (store, small):
+        policy = new_policy(data.split("train"), resolve_config("dt", None, TINY)).eval()
+        windows = data.split("train").windows(np.zeros(30, dtype=int), np.arange(30), 5)
+        losses.append(float(policy.action_loss(windows)))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)

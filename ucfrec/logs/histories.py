@@ -168,7 +168,7 @@ def read_histories(
     files = log_files(paths)
     with (
         scratch_folder(Path(gettempdir()), "histories") as folder,
-        engine(files, folder, memory_limit, shared=True) as connection,
+        engine(files, folder, memory_limit) as connection,
     ):
         tables = open_log_tables(connection, files, mapping, reward, session_by)
         yield from _read_users(tables, last, duplicates, folder)

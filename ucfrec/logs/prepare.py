@@ -223,7 +223,7 @@ def read_log(
     inputs = (*files, *(file for file in id_files if file.is_file()), *feature_files)
     with (
         scratch_folder(spill, "sorted") as scratch,
-        engine(inputs, spill, options.memory_limit, shared=True) as connection,
+        engine(inputs, spill, options.memory_limit) as connection,
     ):
         with progress(4, "check the logs", "stages") as stage:
             opened = open_log_tables(connection, files, mapping, reward, session_by)

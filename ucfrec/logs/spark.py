@@ -50,15 +50,15 @@ from ucfrec.logs.typed import (
     ROWS,
     LogTables,
     TypedLog,
-    describe_log,
+    measure_vectors,
     number_rows,
     open_log_tables,
     survey_vectors,
     type_columns,
 )
 
-MEMORY: Final = "1GB"
-"""Memory of DuckDB in a task."""
+MEMORY: Final = "2GB"
+"""Memory of the process of a task."""
 PART_ROWS: Final = 1_000_000
 """About so many rows are a part; a user's rows are never in two."""
 _TYPES: Final = {
@@ -138,20 +138,20 @@ def _type_rows(
     """The log, and a Spark frame of its rows as of `mark_faults`, read from files in `scratch`."""
     typed = type_columns(tables)
     with explain_errors(tables.connection, tables.tables):
-        every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
+        every = zip(typed.selects, typed.tables, strict=True)
         tables.connection.execute(f"CREATE VIEW {ROWS} AS {number_rows(every)}")
     files = [
-        (single := replace(table, files=(file,)), f"({number_rows([(values, single.sql)])})")
+        (single := replace(table, files=(file,)), f"({number_rows([(values, single)])})")
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
     surveys = [
-        Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.names, rows)})")
+        Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.columns, rows)})")
         for n, (file, rows) in enumerate(files)
     ]
     columns = f"file bigint, {schema.ACTION} bigint, {schema.OBSERVATION} bigint, n bigint"
     survey = _run(spark, surveys, f"{columns}, bad bigint").collect()
-    log = describe_log(tables, typed, [row[1:] for row in survey])
+    log = measure_vectors(typed, [row[1:] for row in survey])
     tasks, rows_before = [], 0
     for number, (file, rows) in enumerate(files):
         faulty = mark_faults(log, rows, known_items)

@@ -191,47 +191,46 @@ def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
 
 def format_report(report: Mapping[str, Any]) -> str:
     """The report of `prepare` as a text table with one count per line."""
-    lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
-    for reason, rows in report["dropped"].items():
-        if rows:
-            lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
-
-    def add(label: str, n: int | None, text: str = "", always: bool = False) -> None:
-        if n or always:
-            lines.append((label, f"{n:,}{text}"))
-
-    rule = DUPLICATES[report.get("duplicates", "highest")]
+    rule, session_by = DUPLICATES[report.get("duplicates", "highest")], report["session_by"]
+    counts = [
+        (f"  dropped: {reason}", rows, f"  {REASONS.get(reason, '')}")
+        for reason, rows in report["dropped"].items()
+    ]
     conflicts = f"  duplicates with a different reward from the kept row, which {rule}"
-    add("  conflicting duplicates", report["conflicting_duplicates"], conflicts)
-    add("  at equal times", report["equal_times"], " (in no order that could be learned)")
-    add("  out of order", report["unsorted_rows"], " (sorted, none dropped)", always=True)
-    add("steps kept", report["steps"], always=True)
-    add("users", report["users"], always=True)
-    add("items", report.get("items"))
-    add("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite")
-    add("sessions", report["sessions"], f" by {report['session_by']}", always=True)
-    add("  cut at a split", report["sessions_cut"])
-    censored = "  may have gone on after the log ended"
-    add("  censored", report.get("sessions_censored"), censored)
+    counts += [
+        ("  conflicting duplicates", report["conflicting_duplicates"], conflicts),
+        ("  at equal times", report["equal_times"], " (in no order that could be learned)"),
+        ("  out of order", report["unsorted_rows"], " (sorted, none dropped)"),
+        ("steps kept", report["steps"], ""),
+        ("users", report["users"], ""),
+        ("items", report.get("items"), ""),
+        ("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite"),
+        ("sessions", report["sessions"], f" by {session_by}"),
+        ("  cut at a split", report["sessions_cut"], ""),
+        ("  censored", report.get("sessions_censored"), "  may have gone on after the log ended"),
+    ]
+    lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
+    lines += [(label, f"{n:,}{text}") for label, n, text in counts if n or "out of" in label]
     lines += [
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
     ]
-    for name, tables in report.get("feature_tables", {}).items():
-        for file, kinds in tables.items():
-            columns = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no columns"
-            lines.append((f"{name} features", f"{columns} from {one_line(file)}"))
+    lines += [
+        (f"{name} features", f"{', '.join(f'{n} {kind}' for kind, n in kinds.items())} from {file}")
+        for name, tables in report.get("feature_tables", {}).items()
+        for file, kinds in tables.items()
+    ]
     lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
     if (share := report.get("return_length_share")) is not None:
         ahead = f"{share:.0%} of its variance is the number of steps left"
-        if report["session_by"] == "user":
+        if session_by == "user":
             ahead += ", which is random where sessions are users: policies learn the next step's"
         lines.append(("return-to-go", ahead))
     statistics = report["reward_statistics"].items()
     figures = ", ".join(f"{name} {value:.4g}" for name, value in statistics)
-    lines.append(("reward", f"{one_line(report['reward'])}: {figures}"))
+    lines.append(("reward", f"{report['reward']}: {figures}"))
     width = max(len(name) for name, _ in lines) + 2
-    return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
+    return "\n".join(one_line(f"{name:<{width}}{value}").rstrip() for name, value in lines)
 
 
 def format_summary(report: Mapping[str, Any]) -> str:
@@ -264,10 +263,10 @@ def require_rows(
     if grown is not None and late and late == n_wanted:
         (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
         # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
-        if EARLIEST_MS <= latest < log.earliest_ms:
+        if EARLIEST_MS <= latest < log.mapping.earliest_ms:
             raise NoRowsError(
                 f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
-                f"of {_clock(log.earliest_ms - 1)} UTC; give newer logs"
+                f"of {_clock(log.mapping.earliest_ms - 1)} UTC; give newer logs"
             )
     reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
     hint = f"; {_CLOCK_HINT}" if late else ""

@@ -2,11 +2,11 @@
 
 import re
 from calendar import month_name
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter, namedtuple
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import duckdb
 
@@ -88,39 +88,25 @@ def open_log_tables(
 
 
 @dataclass(frozen=True)
-class TypedColumns:
-    """SQL of the typed columns of a log."""
-
-    names: tuple[str, ...]
-    """Log columns that the files have, `user_id` first."""
-    selects: tuple[str, ...]
-    """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
-    tables: tuple[Table, ...]
-    """The tables with no other columns than these values need."""
-    session_by: str
-    """"session_id", "gap" or "user"."""
-
-
-@dataclass(frozen=True)
 class TypedLog:
-    """A log whose rows, unchecked, are the relation `read` of `connection`.
+    """A log with SQL of its typed columns; `open_log` creates the relation `read` of its rows.
 
     `read` has the log columns of `columns` in the types of the schema, `reward` (DOUBLE) and `row`
-    (position in the files, from 1).
+    (position in the files, from 1); no row has been checked.
     """
 
     connection: duckdb.DuckDBPyConnection
     tables: tuple[Table, ...]
+    """The tables with no other columns than the values need."""
+    selects: tuple[str, ...]
+    """For each table, the values of `columns`, `reward` and perhaps `WANTED`, as after SELECT."""
     columns: tuple[str, ...]
     """Log columns that the files have, `user_id` first."""
-    vector_size: dict[str, int]
-    """Dimensions of `action` and `observation`, if the log has them."""
     session_by: str
     """"session_id", "gap" or "user"."""
-    earliest_ms: int
-    """Rows with an earlier time (ms) are dropped as clock errors."""
-    has_condition: bool
-    """Whether its rows have the column `WANTED`."""
+    mapping: LogMapping
+    vector_size: Mapping[str, int] = field(default_factory=dict)
+    """Dimensions of `action` and `observation`, if the log has them; see `measure_vectors`."""
 
     @property
     def key(self) -> str:
@@ -153,7 +139,7 @@ class TypedLog:
             raise InputError(f"{self.name}: its actions are vectors; map item_id instead")
 
 
-def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
+def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
     """Resolve the columns and the reward of a log; `as_text` are ids that are text even if all of
     them are integers.
 
@@ -175,33 +161,33 @@ def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
     for name in _IDS:
         if name in columns:
             _unify_ids(log.connection, selects, name, name in as_text)
-    return TypedColumns(
-        columns,
-        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+    return TypedLog(
+        log.connection,
         tuple(table for table, _ in selects),
+        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+        columns,
         log.session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
+        log.mapping,
     )
 
 
-def number_rows(selects: Iterable[tuple[str, str]]) -> str:
-    """SQL of typed rows with `row`, their position from 1; for each table, values as of
-    `TypedColumns.selects` and the SQL of the table."""
-    union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in selects)
+def number_rows(selects: Iterable[tuple[str, Table]]) -> str:
+    """SQL of typed rows with `row`, their position from 1, of values as of `TypedLog.selects`."""
+    union = " UNION ALL ".join(f"SELECT {values} FROM {table.sql}" for values, table in selects)
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
 def open_log(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
-    """Create `read` from the tables of a log; see `type_columns` and `describe_log`."""
+    """Create `read` from the tables of a log; see `type_columns` and `measure_vectors`."""
     typed = type_columns(log, as_text)
     with explain_errors(log.connection, log.tables):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
-        columnar = all(table.columnar for table in log.tables)
-        rows = number_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
-        log.connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
-        has_vectors = {*_VECTORS} & {*typed.names}
-        query = survey_vectors(typed.names, ROWS)
-        survey = log.connection.sql(query).fetchall() if has_vectors else []
-    return describe_log(log, typed, survey)
+        kind = "VIEW" if all(table.columnar for table in log.tables) else "TABLE"
+        rows = number_rows(zip(typed.selects, typed.tables, strict=True))
+        log.connection.execute(f"CREATE {kind} {ROWS} AS {rows}")
+        query = survey_vectors(typed.columns, ROWS)
+        has_vectors = {*_VECTORS} & {*typed.columns}
+        return measure_vectors(typed, log.connection.sql(query).fetchall() if has_vectors else [])
 
 
 def survey_vectors(columns: Collection[str], rows: str) -> str:
@@ -213,21 +199,20 @@ def survey_vectors(columns: Collection[str], rows: str) -> str:
     return f"SELECT {', '.join(sizes)}, {aggregates} FROM {rows} GROUP BY ALL"
 
 
-def describe_log(
-    log: LogTables, typed: TypedColumns, survey: Sequence[tuple[int | None, ...]]
-) -> TypedLog:
-    """The log of typed columns, whose rows its connection has; `survey` as of `survey_vectors`,
-    empty without vectors.
+def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLog:
+    """The log with the sizes of its vectors, by the rows of `survey_vectors`.
 
     Raises InputError if a column has vectors of unequal or no size, or an observation is not
     finite.
     """
     sizes: dict[str, int] = {}
-    for name in (name for name in _VECTORS if name in typed.names):
+    for place, name in enumerate(_VECTORS):
+        if name not in log.columns:
+            continue
         counts: Counter[int] = Counter()
-        for *row_sizes, n, _ in survey:
-            if (size := row_sizes[_VECTORS.index(name)]) is not None:
-                counts[size] += n or 0
+        for row in survey:
+            if row[place] is not None:
+                counts[row[place]] += row[-2]
         ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
         if len(ordered) > 1:
             lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
@@ -237,21 +222,13 @@ def describe_log(
                 f"{name} is empty in every row; map another column or --column {name}="
             )
         sizes[name] = ordered[0][0]
-    if bad := sum(row[-1] or 0 for row in survey):
+    if bad := sum(row[-1] for row in survey):
         raise InputError(
             f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
-            f"in {bad:,} of {sum(row[-2] or 0 for row in survey):,} rows; fill them in, leave "
-            f"those rows out, or ignore the column with --column {schema.OBSERVATION}="
+            f"in {bad:,} of {sum(row[-2] for row in survey):,} rows; fill them in, leave those "
+            f"rows out, or ignore the column with --column {schema.OBSERVATION}="
         )
-    return TypedLog(
-        log.connection,
-        typed.tables,
-        typed.names,
-        sizes,
-        typed.session_by,
-        log.mapping.earliest_ms,
-        log.mapping.where is not None,
-    )
+    return replace(log, vector_size=sizes)
 
 
 def not_finite(vector: str) -> str:
@@ -457,19 +434,9 @@ def _unify_ids(
         values[name] = (typed, "")
 
 
-class _Survey(NamedTuple):
-    """Of the text in a column of one file: how many are what, and the largest parts of dates."""
-
-    filled: int
-    numbers: int
-    iso: int
-    dated: int
-    """Times that begin with the day or the month; the next three are of these."""
-    first: int | None
-    second: int | None
-    example: str | None
-    strange: str | None
-    """Text that is none of these."""
+_Survey = namedtuple("_Survey", "filled numbers iso dated first second example strange")
+"""Of the text in a column of one file: how many are what, and of those that begin with the day or
+the month (`dated`) the largest numbers and one; and one that is none of these."""
 
 
 def cast_text_time(
@@ -533,25 +500,24 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
     dated = f"regexp_full_match(x, {quote(_DAY_OR_MONTH_FIRST)})"
     number = "TRY_CAST(x AS DOUBLE) IS NOT NULL"
     first, second = (
-        f"TRY_CAST(regexp_extract(x, {quote('^' + _DAY_OR_MONTH_FIRST + '$')}, {n}) AS INTEGER)"
+        f"max(TRY_CAST(regexp_extract(x, {quote(f'^{_DAY_OR_MONTH_FIRST}$')}, {n}) AS INTEGER))"
         for n in (1, 2)
     )
     (row,) = connection.sql(
         f"SELECT count(x), count_if({number}), count_if({iso}), count_if({dated}), "
-        f"max({first}), max({second}), min(CASE WHEN {dated} THEN x END), "
+        f"coalesce({first}, 0), coalesce({second}, 0), min(CASE WHEN {dated} THEN x END), "
         f"min(CASE WHEN NOT ({number} OR {iso} OR {dated}) THEN x END) "
         f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"
     ).fetchall()
-    return _Survey._make(row)
+    return _Survey(*row)
 
 
 def _order(file: Path, survey: _Survey) -> str:
     """How day and month follow each other in a file: "%d/%m" or "%m/%d"."""
-    days = (survey.first or 0) > 12, (survey.second or 0) > 12
-    if days[0] != days[1]:
-        return "%d/%m" if days[0] else "%m/%d"
-    where, example = f"{file}: timestamp is {survey.example!r:.40}", str(survey.example)
-    if all(days):
+    if (survey.first > 12) != (survey.second > 12):
+        return "%d/%m" if survey.first > 12 else "%m/%d"
+    where, example = f"{file}: timestamp is {survey.example!r:.40}", survey.example
+    if survey.first > 12:
         raise InputError(
             f"{where}, and neither day/month nor month/day reads every row; say how times are "
             "written with --time-format"

@@ -32,6 +32,7 @@ from ucfrec.logs.tables import (
     quote,
     quote_name,
 )
+from ucfrec.settings import nearest
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -214,12 +215,7 @@ def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping
 
 
 def _missing(table: Table, what: str, name: str) -> InputError:
-    import difflib
-
-    folded = {column.casefold(): column for column in table.columns}
-    near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
-    hint = ", ".join(folded[column] for column in near)
-    hint = f"nearest: {hint}" if hint else f"it has {', '.join(table.columns)}"
+    hint = nearest(name, list(table.columns))
     return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
 
 

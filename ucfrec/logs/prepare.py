@@ -27,12 +27,10 @@ from ucfrec.logs.features import (
     encode_ids,
     feature_digest,
     load_features,
-    note_unread_features,
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
-from ucfrec.logs.tables import first_and_more
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
@@ -244,7 +242,6 @@ def read_log(
                 summary.note_losses(rows, reward, mapping.where)
                 if store is None:
                     summary.require_variety(rows)
-                    note_unread_features(files, mapping)
                 stage.update()
                 bounds = sessions.split_bounds(
                     rows, (1.0, 0.0, 0.0) if evaluates else options.split
@@ -263,8 +260,6 @@ def read_log(
                 sessions.number_ids(log, features, store, grows)
                 report = {"reward": reward, **summary.build_report(rows, cut, counts)}
                 summary.note_oddities(rows, report, mapping)
-                if store is None and len(options.split) == 2:
-                    summary.note_empty_splits(rows, report)
                 stage.update()
                 for name, names in features.items():
                     tables = tables_of_ids[name]
@@ -277,10 +272,7 @@ def read_log(
                     "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
                     "feature_tables": {
-                        name: {
-                            first_and_more([*map(Path, t.files)]): count_features(connection, rows)
-                            for t, rows in zip(tables_of_ids[name], names, strict=True)
-                        }
+                        name: count_features(connection, tables_of_ids[name], names)
                         for name, names in features.items()
                     },
                 }

@@ -25,7 +25,6 @@ from ucfrec.logs.sessions import (
     USED_ITEMS,
     USED_USERS,
     Cut,
-    Moments,
     StepCounts,
     read_episodes,
 )
@@ -75,6 +74,9 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         f"SELECT count(*) FILTER (begins_session), count(*) FILTER (NOT terminated) FROM {EPISODES}"
     )
     users, censored = log.one(f"SELECT count(*), count(*) FILTER (NOT ended) FROM {USED_USERS}")
+    (return_to_go, both), (_, ahead) = counts.returns.covariance
+    # What is left of the rounding errors of equal returns is not variance.
+    varies = return_to_go > 1e-24 * counts.returns.mean[0] ** 2 and ahead
     report: dict[str, Any] = {
         "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
@@ -95,7 +97,7 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "sessions": sessions,
         "sessions_cut": unfinished - censored,
         "sessions_censored": censored,
-        "return_length_share": _explain_returns(counts.returns),
+        "return_length_share": float(both**2 / (return_to_go * ahead)) if varies else None,
         "users": users,
         "splits": splits,
         "time_range_ms": [counts.first_ms, counts.last_ms],
@@ -111,16 +113,6 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
     if schema.PROPENSITY in log.columns:
         report["unknown_propensities"] = counts.unknown_propensities
     return report
-
-
-def _explain_returns(returns: Moments) -> float | None:
-    """Share of the variance of training returns-to-go, of the whole rest of the session, that the
-    number of steps left explains; None if either does not vary."""
-    (return_to_go, both), (_, ahead) = returns.covariance
-    # What is left of the rounding errors of equal returns is not variance.
-    if return_to_go <= 1e-24 * returns.mean[0] ** 2 or not ahead:
-        return None
-    return float(both**2 / (return_to_go * ahead))
 
 
 def _measure_distributions(
@@ -420,18 +412,6 @@ def _propose_times(log: TypedLog, mapping: LogMapping) -> str:
                 log.one(f"SELECT max({sums.sql}::VARCHAR) FROM {table.of(sums.columns).sql}")
             return f": --column timestamp='{expression}'"
     return ""
-
-
-def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:
-    """Warn of times of a split that leave a part of the log without rows."""
-    if names := [name for name, split in report["splits"].items() if not split["steps"]]:
-        begin, end = map(_clock, report["time_range_ms"])
-        _note(
-            rows,
-            f"--split {','.join(map(_clock, report['split_times_ms']))} leaves no rows for "
-            f"{' and '.join(names)}: the rows are from {begin} to {end} UTC; give times between "
-            "these, or three shares",
-        )
 
 
 def _note(rows: SortedRows, message: str) -> None:

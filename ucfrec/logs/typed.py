@@ -329,8 +329,21 @@ def _cast_value(
     nothing = "false" if name == schema.IS_RANDOM else f"CAST(NULL AS {_TYPES[name]})"
     if kind == NOTHING:
         return nothing, NOTHING
-    if name in _IDS or name == schema.TIMESTAMP:
-        _require_exact(connection, table, name, expression, bound.columns)
+    # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
+    inexact = {schema.TIMESTAMP: ("FLOAT",), **dict.fromkeys(_IDS, WHOLE)}.get(name, ())
+    for column in (column for column in bound.columns if table.columns[column] in inexact):
+        real = table.columns[column]
+        with explain_errors(connection, (table,)):
+            ((rounded, count),) = connection.sql(
+                f"SELECT count_if(abs(x) >= {WHOLE[real]}), count(x) FROM "
+                f"(SELECT {quote_name(column)} AS x FROM {table.of([column]).sql})"
+            ).fetchall()
+        if rounded:
+            raise InputError(
+                f"{table.files[0]}: {name} ({expression}) reads {column}, which is {real}, and "
+                f"{rounded:,} of {count:,} values are {WHOLE[real]:,} or more and rounded; write "
+                "them as int64 where the log is made, as a cast here cannot restore them"
+            )
     if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
@@ -365,33 +378,6 @@ def _cast_value(
     if not connection.sql(f"SELECT 1 FROM {table.sql} WHERE {sql} IS NOT NULL LIMIT 1").fetchall():
         return nothing, NOTHING
     raise wrong_type(table, name, expression, kind, remedy)
-
-
-def _require_exact(
-    connection: duckdb.DuckDBPyConnection,
-    table: Table,
-    name: str,
-    expression: str,
-    columns: Sequence[str],
-) -> None:
-    """Refuse an id or a time of columns of reals that do not hold every whole number there is."""
-    for column in columns:
-        kind = table.columns[column]
-        # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
-        if kind not in WHOLE or (name == schema.TIMESTAMP and kind == "DOUBLE"):
-            continue
-        with explain_errors(connection, (table,)):
-            ((rounded, count),) = connection.sql(
-                f"SELECT count_if(abs(x) >= {WHOLE[kind]}), count(x) FROM "
-                f"(SELECT {quote_name(column)} AS x FROM {table.of([column]).sql})"
-            ).fetchall()
-        if rounded:
-            raise InputError(
-                f"{table.files[0]}: {name} ({expression}) reads {column}, which is {kind} "
-                f"(float{32 if kind == 'FLOAT' else 64}): {rounded:,} of {count:,} values are "
-                f"{WHOLE[kind]:,} or more and rounded; write them as int64 where the log is made, "
-                "as a cast here cannot restore them"
-            )
 
 
 def _unify_ids(
@@ -490,9 +476,7 @@ def cast_text_time(
     # DuckDB reads no zone after a blank.
     plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
     time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
-    if not iso:
-        return number
-    return f"coalesce({time}, {number})" if numbers else time
+    return f"coalesce({number}, {time})"
 
 
 def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _Survey:

@@ -158,7 +158,7 @@ LOGS: dict[str, tuple[Act, str]] = {
     "no training": (log_with(split=(5.0, 6.0)), r"no row is in the training split, before 1970"),
     "unequal lists": (
         log_with(observation=[[1.0] * (1 + (i == 7)) for i in range(400)]),
-        r"observation has lists of unequal length: 399 rows of 1, 1 rows of 2",
+        r"observation has lists of unequal length, 1 to 2; make them equal",
     ),
     "an observation that is NaN": (
         log_with(observation=[np.array([1.0, n or np.nan]) for n in range(400)]),
@@ -239,7 +239,6 @@ LOGS: dict[str, tuple[Act, str]] = {
     "another kind of file": (lambda f: log_files([write(random_log(1), f / "log.txt")]),
                              r"log\.txt is not a .parquet or"),
     "no file at all": (lambda f: log_files([]), "no log was named"),
-    "a frame": (lambda f: prepare(random_log(), LogMapping(), f / "store"), "paths is a frame"),  # type: ignore[arg-type]
     "a store like no store": (
         lambda f: prepare([write(random_log(), f / "l.csv")], LogMapping(), f / "store", like=f),
         "neither an episode store nor a run",

@@ -39,14 +39,6 @@ CODES: Final = {
 FAULTY: Final = "faulty"
 """View of all rows, as of `mark_faults`."""
 FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
-DUPLICATES: Final = {
-    "highest": "has the highest",
-    "lowest": "has the lowest",
-    "first": "comes first in the files",
-    "last": "comes last in the files",
-}
-"""Which of several rows with the same user, item or action, and time is kept: rule to its
-description."""
 PRIME: Final = 2**31 - 1
 USER_FACTOR: Final = 7919
 HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
@@ -244,7 +236,7 @@ def sort_rows(
     """Sort the rows of a log with DuckDB.
 
     Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
-    `duplicates` is a key of `DUPLICATES`, `folder` for scratch (None for a log in memory). With
+    `duplicates` is as of `PrepareOptions`, `folder` for scratch (None for a log in memory). With
     `by_session`, the rows of a session follow each other. Raises InputError if a reward is too
     large to train with.
     """

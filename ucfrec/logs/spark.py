@@ -48,6 +48,7 @@ from ucfrec.logs.summary import NoRowsError, note_dropped, require_rows
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
+    VECTORS,
     LogTables,
     TypedLog,
     measure_vectors,
@@ -147,8 +148,8 @@ def _type_rows(
         Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.columns, rows)})")
         for n, (file, rows) in enumerate(files)
     ]
-    columns = f"file bigint, {schema.ACTION} bigint, {schema.OBSERVATION} bigint, n bigint"
-    survey = _run(spark, surveys, f"{columns}, bad bigint").collect()
+    names = ("file", *(f"{end}_{v}" for v in VECTORS for end in ("min", "max")), "n", "bad")
+    survey = _run(spark, surveys, ", ".join(f"{name} bigint" for name in names)).collect()
     log = measure_vectors(typed, [row[1:] for row in survey])
     tasks, rows_before = [], 0
     for number, (file, rows) in enumerate(files):

@@ -18,7 +18,7 @@ from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind, text_of_column
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
-from ucfrec.logs.rows import DUPLICATES, REASONS, SortedRows, mix_bits
+from ucfrec.logs.rows import REASONS, SortedRows, mix_bits
 from ucfrec.logs.sessions import (
     EPISODES,
     FEW_VALUES,
@@ -183,12 +183,12 @@ def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
 
 def format_report(report: Mapping[str, Any]) -> str:
     """The report of `prepare` as a text table with one count per line."""
-    rule, session_by = DUPLICATES[report.get("duplicates", "highest")], report["session_by"]
+    rule, session_by = report.get("duplicates", "highest"), report["session_by"]
     counts = [
         (f"  dropped: {reason}", rows, f"  {REASONS.get(reason, '')}")
         for reason, rows in report["dropped"].items()
     ]
-    conflicts = f"  duplicates with a different reward from the kept row, which {rule}"
+    conflicts = f"  duplicates with a different reward from the kept row, the {rule}"
     counts += [
         ("  conflicting duplicates", report["conflicting_duplicates"], conflicts),
         ("  at equal times", report["equal_times"], " (in no order that could be learned)"),

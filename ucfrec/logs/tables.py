@@ -10,6 +10,7 @@ import gzip
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Final, TextIO, cast
 
@@ -223,19 +224,19 @@ def open_tables(
     as `date=2026-08-01` give columns. Raises InputError if a file is truncated or not of the kind
     that its suffix says, no file has a row, or a column has another value than the folder says.
     """
-    tables: list[Table] = []
+    singles = []
     for file in files:
-        columns = _columns(connection, file)
-        if columns is None:
-            continue
-        opened = Table((file,), columns)
-        if partitions:
-            opened = replace(opened, partitions=_partitions(connection, opened))
-        same = replace(tables[-1], files=opened.files) if tables else None
-        if same == opened and tables[-1].files[0].suffix == file.suffix:
-            tables[-1] = replace(opened, files=(*tables[-1].files, file))
-        else:
-            tables.append(opened)
+        if columns := _columns(connection, file):
+            single = Table((file,), columns)
+            folders = _partitions(connection, single) if partitions else ()
+            singles.append(replace(single, partitions=folders))
+    tables = [
+        replace(first, files=(*first.files, *(table.files[0] for table in more)))
+        for first, *more in (
+            [*group]
+            for _, group in groupby(singles, lambda t: (t.types, t.partitions, t.files[0].suffix))
+        )
+    ]
     if not tables:
         raise InputError(
             f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"

@@ -2,7 +2,7 @@
 
 import re
 from calendar import month_name
-from collections import Counter, namedtuple
+from collections import namedtuple
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +21,6 @@ from ucfrec.logs.engine import (
     text_of_column,
     wrong_type,
 )
-from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 from ucfrec.logs.tables import (
     ISO_TIME,
@@ -44,7 +43,7 @@ ROWS: Final = "read"
 """Relation of `TypedLog`."""
 WANTED: Final = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
-_VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
+VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
 _BATCH_BYTES: Final = 2**25
 _IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
 """SQL of whether a text `x` is as the integer that it means is written."""
@@ -80,11 +79,13 @@ def open_log_tables(
     mapping: LogMapping,
     reward: str,
     session_by: str | None,
+    tables: Sequence[Table] = (),
 ) -> LogTables:
-    """Open the files of a log, and settle which of the remembered columns they have."""
-    tables = tuple(open_tables(connection, files, mapping.partitions))
-    mapping, reward = settle_mapping(connection, tables, mapping, reward)
-    return LogTables(connection, tables, mapping, reward, session_by)
+    """Open the files of a log, unless its tables are given, and settle which of the remembered
+    columns they have."""
+    opened = tuple(tables or open_tables(connection, files, mapping.partitions))
+    mapping, reward = settle_mapping(connection, opened, mapping, reward)
+    return LogTables(connection, opened, mapping, reward, session_by)
 
 
 @dataclass(frozen=True)
@@ -186,17 +187,20 @@ def open_log(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
         rows = number_rows(zip(typed.selects, typed.tables, strict=True))
         log.connection.execute(f"CREATE {kind} {ROWS} AS {rows}")
         query = survey_vectors(typed.columns, ROWS)
-        has_vectors = {*_VECTORS} & {*typed.columns}
+        has_vectors = {*VECTORS} & {*typed.columns}
         return measure_vectors(typed, log.connection.sql(query).fetchall() if has_vectors else [])
 
 
 def survey_vectors(columns: Collection[str], rows: str) -> str:
-    """SQL of the sizes of `action` and `observation` in rows of a log with some columns, the number
-    `n` of rows with these, and how many of them have no finite observation."""
-    sizes = (f"CAST({f'len({v})' if v in columns else 'NULL'} AS BIGINT) AS {v}" for v in _VECTORS)
+    """SQL of the least and the largest size of `action` and of `observation` in rows of a log with
+    some columns, the number `n` of rows, and how many of them have no finite observation."""
+    sizes = (
+        f"CAST({end}({f'len({name})' if name in columns else 'NULL'}) AS BIGINT) AS {end}_{name}"
+        for name in VECTORS
+        for end in ("min", "max")
+    )
     bad = f"count_if({not_finite(schema.OBSERVATION)})" if schema.OBSERVATION in columns else "0"
-    aggregates = f"count(*) AS n, CAST({bad} AS BIGINT) AS bad"
-    return f"SELECT {', '.join(sizes)}, {aggregates} FROM {rows} GROUP BY ALL"
+    return f"SELECT {', '.join(sizes)}, count(*) AS n, CAST({bad} AS BIGINT) AS bad FROM {rows}"
 
 
 def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLog:
@@ -206,22 +210,19 @@ def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLo
     finite.
     """
     sizes: dict[str, int] = {}
-    for place, name in enumerate(_VECTORS):
-        if name not in log.columns:
-            continue
-        counts: Counter[int] = Counter()
-        for row in survey:
-            if row[place] is not None:
-                counts[row[place]] += row[-2]
-        ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
-        if len(ordered) > 1:
-            lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
-            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
-        if not ordered or ordered[0][0] == 0:
-            raise InputError(
-                f"{name} is empty in every row; map another column or --column {name}="
-            )
-        sizes[name] = ordered[0][0]
+    for place, name in enumerate(VECTORS):
+        if name in log.columns:
+            ends = [n for row in survey for n in row[2 * place : 2 * place + 2] if n is not None]
+            sizes[name] = max(ends, default=0)
+            if min(ends, default=0) < sizes[name]:
+                raise InputError(
+                    f"{name} has lists of unequal length, {min(ends)} to {sizes[name]}; make them "
+                    "equal"
+                )
+            if not sizes[name]:
+                raise InputError(
+                    f"{name} is empty in every row; map another column or --column {name}="
+                )
     if bad := sum(row[-1] for row in survey):
         raise InputError(
             f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
@@ -300,18 +301,13 @@ def _bind_reward(
     try:
         return table, bind(connection, table, "for the reward", reward)
     except InputError:
-        try:
-            names = {name.casefold() for name in columns_of(connection, reward)}
-        except NotScalarError:
-            names = set()
-        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in names]
+        words = re.findall(r"\w+", reward.casefold())
+        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in words]
         if not texts:
             raise
         counts = ", ".join(f"count({quote_name(name)})" for name in texts)
         (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
         empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
-        if not empty:
-            raise
         table = replace(table, types=tuple((dict(table.types) | empty).items()))
         return table, bind(connection, table, "for the reward", reward)
 

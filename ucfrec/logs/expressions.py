@@ -8,6 +8,7 @@ tree) and every node of the tree must be of a kind listed here.
 import json
 import re
 from collections.abc import Collection, Iterator
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ucfrec import schema
@@ -148,11 +149,9 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
     """
     if len(expression) > MAX_LENGTH:
         raise NotScalarError(f"it has {len(expression):,} characters; {MAX_LENGTH:,} are allowed")
-    depth = 0
-    for char in expression:
-        depth += (char in "([{") - (char in ")]}")
-        if depth > MAX_NESTING:
-            raise NotScalarError(_TOO_DEEP)
+    depths = accumulate((char in "([{") - (char in ")]}") for char in expression)
+    if max(depths, default=0) > MAX_NESTING:
+        raise NotScalarError(_TOO_DEEP)
     # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
     # largest if every CASE has the same number of WHENs.
     cases, whens = len(_SIMPLE_CASE.findall(expression)), len(_WHEN.findall(expression))

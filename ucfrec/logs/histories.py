@@ -16,7 +16,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
-from ucfrec.logs.engine import engine, explain_errors
+from ucfrec.logs.engine import engine, explain_errors, settle_mapping
 from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
@@ -190,7 +190,8 @@ def frame_histories(
         relation = connection.table(HISTORIES)
         types = zip(relation.columns, map(str, relation.types), strict=True)
         table = FrameTable((Path(HISTORIES),), tuple(types))
-        tables = open_log_tables(connection, (), mapping, reward, session_by, (table,))
+        mapping, reward = settle_mapping(connection, (table,), mapping, reward)
+        tables = LogTables(connection, (table,), mapping, reward, session_by)
         yield from _read_users(tables, last, duplicates, None)
 
 

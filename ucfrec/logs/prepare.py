@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, InstanceOf
 
@@ -34,6 +34,9 @@ from ucfrec.logs.rows import SortedRows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
+
+_REMEMBERED: Final = ("duplicates", "dataset", "min_steps", "max_session")
+"""Options that the record of a store has."""
 
 
 @settings_table("")
@@ -214,7 +217,7 @@ def read_log(
         file for tables in tables_of_ids.values() for t in tables for file in log_files(t.files)
     ]
     id_files = [store / file for _, _, file in sessions.ID_TABLES] if store else []
-    inputs = (*files, *(file for file in id_files if file.is_file()), *feature_files)
+    inputs = (*files, *id_files, *feature_files)
     with (
         scratch_folder(spill, "sorted") as scratch,
         engine(inputs, spill, options.memory_limit) as connection,
@@ -239,12 +242,13 @@ def read_log(
                 if store is None:
                     summary.require_variety(rows)
                 stage.update()
-                bounds = sessions.split_bounds(
-                    rows, (1.0, 0.0, 0.0) if evaluates else options.split
-                )
-                gap_ms = round(options.gap_minutes * 60_000)
+                split = (1.0, 0.0, 0.0) if evaluates else options.split
                 cut = sessions.Cut(
-                    log.session_by, gap_ms, options.min_steps, bounds, options.max_session
+                    log.session_by,
+                    round(options.gap_minutes * 60_000),
+                    options.min_steps,
+                    sessions.split_bounds(rows, split),
+                    options.max_session,
                 )
                 counts = sessions.count_steps(rows, cut)
                 stage.update()
@@ -258,14 +262,10 @@ def read_log(
                 summary.note_oddities(rows, report, mapping)
                 stage.update()
                 for name, names in features.items():
-                    tables = tables_of_ids[name]
-                    require_known_ids(connection, tables, names, name, noted=not grows)
+                    require_known_ids(connection, tables_of_ids[name], names, name, not grows)
+                report |= {name: getattr(options, name) for name in _REMEMBERED}
                 report |= {
-                    "duplicates": options.duplicates,
-                    "dataset": options.dataset,
                     **mapping.remember(),
-                    "min_steps": options.min_steps,
-                    "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
                     "feature_tables": {
                         name: count_features(connection, tables_of_ids[name], names)

@@ -175,9 +175,7 @@ def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution
 
 def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
     """Quantiles, each one of the ascending values, of which there are `counts`."""
-    cumulative = np.cumsum(counts)
-    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
-    chosen = values[np.searchsorted(cumulative, ranks)].tolist()
+    chosen = np.quantile(values, QUANTILES, weights=counts, method="inverted_cdf").tolist()
     return {f"{share:g}": value for share, value in zip(QUANTILES, chosen, strict=True)}
 
 

@@ -6,6 +6,7 @@ columns in any order, and text that looks like a number stays available as text 
 
 import contextlib
 import csv
+import glob
 import gzip
 import re
 from collections.abc import Iterable, Sequence
@@ -22,7 +23,6 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
 
-_MAGIC = re.compile(r"[\[*?]")
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
 _NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
@@ -173,7 +173,7 @@ def _wider_type(kind: str) -> str:
 
 def glob_pattern(file: Path) -> str:
     """Glob pattern that matches only `file`: DuckDB treats every path as a pattern."""
-    return _MAGIC.sub(r"[\g<0>]", str(file))
+    return glob.escape(str(file))
 
 
 def quote(value: str) -> str:
@@ -289,7 +289,7 @@ def _columns(
         if not is_parquet:
             return None
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
-    if "\\" in str(file) and _MAGIC.search(str(file)):
+    if "\\" in str(file) and glob.has_magic(str(file)):
         raise InputError(
             f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
         )

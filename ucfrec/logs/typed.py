@@ -79,13 +79,11 @@ def open_log_tables(
     mapping: LogMapping,
     reward: str,
     session_by: str | None,
-    tables: Sequence[Table] = (),
 ) -> LogTables:
-    """Open the files of a log, unless its tables are given, and settle which of the remembered
-    columns they have."""
-    opened = tuple(tables or open_tables(connection, files, mapping.partitions))
-    mapping, reward = settle_mapping(connection, opened, mapping, reward)
-    return LogTables(connection, opened, mapping, reward, session_by)
+    """Open the files of a log, and settle which of the remembered columns they have."""
+    tables = tuple(open_tables(connection, files, mapping.partitions))
+    mapping, reward = settle_mapping(connection, tables, mapping, reward)
+    return LogTables(connection, tables, mapping, reward, session_by)
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,14 @@ def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
     key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
     optional = (name for name in OPTIONAL_COLUMNS if name in present)
     columns = (schema.USER_ID, key, schema.TIMESTAMP, *optional)
-    _note_partial(log.tables, {*columns, *log.mapping.columns})
+    every = [file for table in log.tables for file in table.files]
+    for name in (n for n in OPTIONAL_COLUMNS if n not in {*columns, *log.mapping.columns}):
+        having = (table for table, folded in zip(log.tables, names, strict=True) if name in folded)
+        if files := [file for table in having for file in table.files]:
+            warn_user(
+                f"{name} is excluded: only {len(files)} of {len(every)} files have it ({files[0]});"
+                f" add it to the others, or drop it with --column {name}="
+            )
     selects = [_select(log, table, columns) for table in log.tables]
     for name in _IDS:
         if name in columns:
@@ -206,20 +211,18 @@ def survey_vectors(columns: Collection[str], rows: str) -> str:
 def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLog:
     """The log with the sizes of its vectors, by the rows of `survey_vectors`.
 
-    Raises InputError if a column has vectors of unequal or no size, or an observation is not
-    finite.
+    Raises InputError if sizes are unequal or 0, or an observation is not finite.
     """
     sizes: dict[str, int] = {}
     for place, name in enumerate(VECTORS):
         if name in log.columns:
             ends = [n for row in survey for n in row[2 * place : 2 * place + 2] if n is not None]
-            sizes[name] = max(ends, default=0)
-            if min(ends, default=0) < sizes[name]:
+            least, sizes[name] = min(ends, default=0), max(ends, default=0)
+            if least < sizes[name]:
                 raise InputError(
-                    f"{name} has lists of unequal length, {min(ends)} to {sizes[name]}; make them "
-                    "equal"
+                    f"{name} has lists of unequal length, {least} to {sizes[name]}; make them equal"
                 )
-            if not sizes[name]:
+            if not least:
                 raise InputError(
                     f"{name} is empty in every row; map another column or --column {name}="
                 )
@@ -236,18 +239,6 @@ def not_finite(vector: str) -> str:
     """SQL that says whether a vector is missing or has a number that is not finite."""
     finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
     return f"{vector} IS NULL OR NOT {finite}"
-
-
-def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
-    """Warn of optional columns, but those excluded, that only some files have."""
-    count = sum(len(table.files) for table in tables)
-    for name in (name for name in OPTIONAL_COLUMNS if name not in excluded):
-        having = (t for t in tables if name in map(str.casefold, t.columns))
-        if files := [file for table in having for file in table.files]:
-            warn_user(
-                f"{name} is excluded: only {len(files)} of {count} files have it ({files[0]}); add "
-                f"it to the others, or drop it with --column {name}="
-            )
 
 
 _Values = dict[str, tuple[str, str]]
@@ -384,7 +375,7 @@ def _unify_ids(
 ) -> None:
     """Cast ids to BIGINT if every file has integers that fit and, in a CSV file, are written as
     integers are (not 007, 7.0 or 1e1), else or with `as_text` to text."""
-    whole, some_whole, with_decimals = True, False, None
+    whole, some_whole, with_decimals = not as_text, False, None
     for table, values in selects:
         sql, kind = values[name]
         # The type that DuckDB inferred for a column of a CSV file, whose text is read.
@@ -403,7 +394,6 @@ def _unify_ids(
         if (csv_type or kind) == "DOUBLE":
             with_decimals = with_decimals or table
         whole &= kind == NOTHING or all_integers
-    whole &= not as_text
     if not whole and some_whole and with_decimals is not None:
         warn_user(
             f"{name} is written as whole numbers and, in {with_decimals.files[0]}, with decimals: "
@@ -454,8 +444,7 @@ def cast_text_time(
                 f"{where} has the day first in some files and the month in others; prepare "
                 "them apart, each with its --time-format"
             )
-        (order,) = orders
-        start = quote("^" + _DAY_OR_MONTH_FIRST + "$")
+        order, start = min(orders), quote("^" + _DAY_OR_MONTH_FIRST + "$")
         plain = rf"trim(regexp_replace(trim({sql}), {start}, '\1/\2/\3 \4'))"
         # A comma or T before the time of day.
         plain = rf"regexp_replace({plain}, '\s+[T,]?\s*', ' ')"
@@ -467,12 +456,11 @@ def cast_text_time(
             f"{where} is {strange!r:.60}, no ISO 8601 time nor milliseconds; say how it is "
             "written with --time-format, e.g. '%d %b %Y %H:%M'"
         )
-    number = f"TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT)"
     plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
     # DuckDB reads no zone after a blank.
     plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
     time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
-    return f"coalesce({number}, {time})"
+    return f"coalesce(TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT), {time})"
 
 
 def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _Survey:

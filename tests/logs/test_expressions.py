@@ -133,12 +133,6 @@ def test_honest_expressions_are_values_of_a_log(
     assert relation.to_arrow_table().shape == (300, 1)
 
 
-def test_columns_are_named_once_in_order(connection: duckdb.DuckDBPyConnection) -> None:
-    text = 'b + least(a, b.c) * CASE x WHEN 1 THEN "d e" END'
-    assert columns_of(connection, text) == ("b", "a", "x", "d e")
-    assert columns_of(connection, "1 + 1") == ()
-
-
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attacks_are_no_scalar_expressions(
     connection: duckdb.DuckDBPyConnection, table: Table, name: str, tmp_path: Path

@@ -1,7 +1,6 @@
 """Features: ids of another type are found, others refused; which items share a tag."""
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.support.logs import START, random_log, store_of, write
+from tests.support.logs import START, random_log, store_of
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.errors import InputNote
 from ucfrec.logs.features import item_tags
@@ -62,23 +61,6 @@ def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
         validate([tmp_path / "log.parquet"], mapping, OPTIONS)
-
-
-def test_features_beside_a_log_that_is_named_alone_are_noted(tmp_path: Path) -> None:
-    logs, items, users = (tmp_path / n for n in ("log.parquet", "items.csv", "users.parquet"))
-    write(random_log(20, users=2, items=2), logs)
-    write(pd.DataFrame({"item_id": [0, 1], "age": [3, 4]}), items)
-    write(pd.DataFrame({"user_id": [0, 1], "age": [3, 4]}), users)
-    given = LogMapping(
-        item_features=(FeatureTable((items,), "item_id"),),
-        user_features=(FeatureTable((users,), "user_id"),),
-    )
-    for kind, file in (("item_features", items), ("user_features", users)):
-        with pytest.warns(InputNote, match=f"{file.name} lies beside the log and is not read"):
-            validate([logs], replace(given, **{kind: ()}), OPTIONS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputNote)
-        validate([logs], given, OPTIONS)
 
 
 Lists = list[list[str | None] | None]

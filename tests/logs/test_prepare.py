@@ -19,12 +19,11 @@ from hypothesis import strategies as st
 from safetensors import SafetensorError
 
 from tests.support.equal_times import tie_key
-from tests.support.logs import START, list_users, write
+from tests.support.logs import START, write
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, read_columns, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 
@@ -176,12 +175,6 @@ def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_log_of_one_row_a_user_is_prepared(tmp_path: Path) -> None:
-    log = pd.DataFrame({"user_id": range(2), "item_id": 1, "reward": range(2)})
-    report = prepared(tmp_path, log.assign(timestamp=START + log.index * MINUTE), ALL_TRAIN)
-    assert (report["unsorted_rows"], report["episodes"]) == (0, 2)
-
-
 def test_given_sessions_stay_together_even_where_they_overlap(tmp_path: Path) -> None:
     log = make_log(users=4).drop_duplicates(KEYS)
     log["session_id"] = np.random.default_rng(1).integers(6, size=len(log))
@@ -228,19 +221,6 @@ def test_a_store_like_another_has_its_numbers(tmp_path: Path) -> None:
     assert set(store.episode_values("user")) == {-1, *range(25)}
     embeddings = EpisodeStore.open(like).item_states.embeddings
     assert store.item_states.embeddings.equal(embeddings)
-
-
-def test_histories_are_the_latest_clean_rows(tmp_path: Path) -> None:
-    log = make_log()
-    path = write(log, tmp_path / "log.parquet")
-    users = list_users(read_histories([path], LogMapping(), "reward * 1", last=5))
-    found = pd.DataFrame(users).set_index("user_id")
-    assert list(found.index) == sorted(log["user_id"].unique())
-    for user, rows in expected_sessions(log, 30).groupby("user_id"):
-        assert list(found["item_ids"][user]) == list(rows["item_id"])[-5:]
-        assert list(found["timestamps"][user]) == list(rows["timestamp"])[-5:]
-        np.testing.assert_array_equal(found["rewards"][user], rows["reward"].astype("f4")[-5:])
-        assert list(found["seen"][user]) == sorted(set(rows["item_id"]))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.logs import summary
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec.logs.sessions import Moments
 
 
@@ -124,15 +124,6 @@ def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path) ->
 def test_a_log_of_a_single_item_is_told_of(tmp_path: Path) -> None:
     (note,) = notes_of(write(make_log(200).assign(item_id=7), tmp_path / "log.parquet"))
     assert "all 200 rows show the same item, so there is nothing to choose between" in note
-
-
-def test_a_split_that_leaves_a_part_without_rows_is_told_of(tmp_path: Path) -> None:
-    path = write(make_log(), tmp_path / "log.parquet")
-    (note,) = notes_of(path, split=parse_split("2030-01-01,2030-01-02"))
-    assert "--split 2030-01-01 00:00:00," in note
-    assert "leaves no rows for validation and test: the rows are from 2023-11-14 22:13:20" in note
-    assert not notes_of(path, split=parse_split("2023-11-16,2023-11-17"))
-    assert not notes_of(path, split=(0.8, 0.2, 0.0))
 
 
 @pytest.mark.parametrize("kind", ["int", "zone", "text"])

@@ -2,10 +2,8 @@
 
 import itertools
 import time
-import timeit
 import warnings
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -255,22 +253,6 @@ def test_truth_values_are_numbers_in_arithmetic(
     report = validate([path], LogMapping(), PrepareOptions(reward=expression))
     expected = value(log[log["is_click"]] if expression.startswith("CASE") else log)
     assert report["reward_statistics"]["mean"] == pytest.approx(expected.mean(), rel=1e-4)
-
-
-# Time
-
-
-def test_columns_that_are_not_used_cost_next_to_nothing(tmp_path: Path) -> None:
-    log = random_log(300)
-    generator = np.random.default_rng(0)
-
-    def seconds(columns: int) -> float:
-        more = pd.DataFrame(generator.random((300, columns))).rename(columns="x{}".format)
-        path = write(pd.concat([log, more], axis=1), tmp_path / "log.parquet")
-        read = partial(validate, [path], LogMapping())
-        return min(timeit.repeat(read, timer=time.process_time, repeat=3, number=1))
-
-    assert seconds(1000) < 1.5 * seconds(10) + 0.1
 
 
 def test_lines_that_begin_with_a_hash_are_rows(tmp_path: Path) -> None:

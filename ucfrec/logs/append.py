@@ -86,7 +86,16 @@ def append_logs(
         raise InputError(f"{store}: logs can be added only to a store of logs of items")
     made_of = _describe_inputs(old, files, mapping, options)
     if (out / StoreRecord.FILE).is_file():
-        return _read_report(out, made_of)
+        remembered = StoreRecord.read(out).source.others
+        if "made_of" not in remembered:
+            raise InputError(f"{out} is a store that no update made; name another folder")
+        if other := [key for key in made_of if remembered["made_of"].get(key) != made_of[key]]:
+            raise InputError(
+                f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "
+                "another folder"
+            )
+        _require_held_out(str(out), remembered["appended"])
+        return dict(remembered["appended"])
     origin = str(store / StoreRecord.FILE)
     shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
     end = find_end(np.concatenate([shard.latest_times() for shard in shards]))
@@ -104,9 +113,8 @@ def append_logs(
         split=options.split,
         duplicates=old.source.duplicates,
         memory_limit=options.memory_limit,
+        gap_minutes=(old.source.session_gap_ms or 1_800_000) / 60_000,
     )
-    if old.source.session_gap_ms is not None:
-        reading = replace(reading, gap_minutes=old.source.session_gap_ms / 60_000)
     late = _rows_after(end, store, shards) if any((s.times > end).any() for s in shards) else None
     with (
         atomic_folder(out) as folder,
@@ -193,32 +201,15 @@ def _describe_inputs(
 ) -> dict[str, Any]:
     """What the grown store depends on, to know it again; the keys name it where it differs."""
     tables = (*mapping.item_features, *mapping.user_features)
-    columns = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
-    texts = {name: str(text) for name, text in columns.items() if text is not None}
     feature_files = (file for table in tables for file in log_files(table.files))
     return {
         "another run's store": old.fingerprint,
         "other logs": [file_checksum(file) for file in files],
-        "other columns or conditions in the mapping": texts,
+        "other columns or conditions in the mapping": mapping.remember(),
         "other feature tables in the mapping": [file_checksum(file) for file in feature_files],
         "another window": options.window_ms,
         "another split": list(options.split),
     }
-
-
-def _read_report(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
-    """The report on a store that is there already."""
-    remembered = StoreRecord.read(out).source.others
-    if "made_of" not in remembered:
-        raise InputError(f"{out} is a store that no update made; name another folder")
-    differences = [key for key in made_of if remembered["made_of"].get(key) != made_of[key]]
-    if differences:
-        raise InputError(
-            f"{out} is a store of {' and of '.join(differences)}; give the same as before, or name "
-            "another folder"
-        )
-    _require_held_out(str(out), remembered["appended"])
-    return dict(remembered["appended"])
 
 
 def _require_held_out(name: str, report: Mapping[str, Any]) -> None:

@@ -32,6 +32,7 @@ from ucfrec.logs.tables import (
     quote,
     quote_name,
 )
+from ucfrec.settings import nearest
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,7 +62,6 @@ def engine(
     inputs: Iterable[Path],
     folder: Path | None,
     memory_limit: str | None = None,
-    shared: bool = False,
     threads: int | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection that can open only the inputs and files in its scratch folder.
@@ -69,8 +69,8 @@ def engine(
     It loads no extension, and its configuration is locked. Every DuckDB connection of ucfrec is
     made here. `folder` is the parent of the scratch folder, which is removed at the end; so is the
     scratch of killed processes in it. None for a database in memory that never uses the disk.
-    Beyond `memory_limit`, such as "2GB", of the engine or with `shared` of the process, whose rest
-    may take half of it, rows spill to disk. Raises InputError if it is not a size.
+    Beyond `memory_limit` of the process, such as "2GB", of which all but the engine may take half,
+    rows spill to disk. Raises InputError if it is not a size.
     """
     with scratch_folder(folder.absolute(), "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
@@ -80,10 +80,10 @@ def engine(
         connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:
-                _set_memory_limit(connection, memory_limit)
-                if (limit := bytes_of(memory_limit)) and shared:
-                    size = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
-                    _set_memory_limit(connection, f"{size} B")
+                if not (limit := bytes_of(memory_limit)):
+                    raise InputError(f"memory_limit {memory_limit!r} is not a size; write e.g. 2GB")
+                limit = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
+                connection.execute(f"SET memory_limit = '{limit} B'")
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
@@ -99,13 +99,6 @@ def engine(
             yield connection
         finally:
             connection.close()
-
-
-def _set_memory_limit(connection: duckdb.DuckDBPyConnection, size: str) -> None:
-    try:
-        connection.execute("SET memory_limit = ?", [size])
-    except duckdb.Error:
-        raise InputError(f"memory_limit {size!r} is not a size; write e.g. 2GB") from None
 
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
@@ -146,15 +139,16 @@ def anonymous_bytes(process: int | None = None) -> int:
 def bytes_of(size: str) -> int | None:
     """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
-    if match is None:
-        return None
-    number, prefix, binary = match.groups()
-    return int(float(number) * (1024 if binary else 1000) ** " kmgt".index(prefix or " "))
+    power = (1024 if match and match[3] else 1000) ** " kmgt".index((match and match[2]) or " ")
+    return int(float(match[1]) * power) if match else None
 
 
 def to_numpy(column: "pa.Array") -> Array:
-    """A column of numbers or truth values without missing ones, copied only if it must be;
-    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log."""
+    """A column of numbers or truth values without missing ones, or the values in its lists, copied
+    only if it must be; `pyarrow.Array.to_numpy` would import pandas, which takes longer than
+    reading a small log."""
+    if str(column.type).startswith("list"):
+        return to_numpy(column.flatten())
     if str(column.type) == "bool":
         return np.from_dlpack(column.cast("uint8")).view(np.bool_)
     return np.from_dlpack(column)
@@ -223,12 +217,7 @@ def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping
 
 
 def _missing(table: Table, what: str, name: str) -> InputError:
-    import difflib
-
-    folded = {column.casefold(): column for column in table.columns}
-    near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
-    hint = ", ".join(folded[column] for column in near)
-    hint = f"nearest: {hint}" if hint else f"it has {', '.join(table.columns)}"
+    hint = nearest(name, list(table.columns))
     return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
 
 

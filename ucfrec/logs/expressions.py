@@ -8,6 +8,7 @@ tree) and every node of the tree must be of a kind listed here.
 import json
 import re
 from collections.abc import Collection, Iterator
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ucfrec import schema
@@ -102,6 +103,10 @@ _ALLOWED: Final = (
 )
 
 
+_TOO_DEEP: Final = f"it is nested more than {MAX_NESTING} levels deep; simplify it"
+_TOO_LARGE: Final = f"it is too large; nest fewer of CASE x WHEN, {', '.join(sorted(COPYING))}"
+
+
 class Expression(str):
     """SQL text, not parsed, with its origin for messages: the file or option that it comes from."""
 
@@ -144,11 +149,9 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
     """
     if len(expression) > MAX_LENGTH:
         raise NotScalarError(f"it has {len(expression):,} characters; {MAX_LENGTH:,} are allowed")
-    depth = 0
-    for char in expression:
-        depth += (char in "([{") - (char in ")]}")
-        if depth > MAX_NESTING:
-            raise _too_deep()
+    depths = accumulate((char in "([{") - (char in ")]}") for char in expression)
+    if max(depths, default=0) > MAX_NESTING:
+        raise NotScalarError(_TOO_DEEP)
     # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
     # largest if every CASE has the same number of WHENs.
     cases, whens = len(_SIMPLE_CASE.findall(expression)), len(_WHEN.findall(expression))
@@ -165,7 +168,7 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
         raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
     columns: dict[str, None] = {}
     if _walk(alone, 0, columns) > MAX_SIZE:
-        raise _too_large()
+        raise NotScalarError(_TOO_LARGE)
     if _growth(alone) > MAX_GROWTH:
         raise NotScalarError(
             f"its text could be {MAX_GROWTH} times as long as its columns'; nest fewer of "
@@ -204,15 +207,6 @@ def _parts(tree: Any) -> Collection[Any]:
     return tree if isinstance(tree, list) else ()
 
 
-def _too_deep() -> NotScalarError:
-    return NotScalarError(f"it is nested more than {MAX_NESTING} levels deep; simplify it")
-
-
-def _too_large() -> NotScalarError:
-    copying = ", ".join(sorted(COPYING))
-    return NotScalarError(f"it is too large; nest fewer of CASE x WHEN, {copying}")
-
-
 def _select(
     connection: "duckdb.DuckDBPyConnection", expression: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -227,10 +221,10 @@ def _select(
         query = "SELECT json_serialize_sql(?)"
         (tree,) = connection.execute(query, [f"SELECT {expression}"]).fetchall()[0]
         if len(tree) > _MAX_TREE:
-            raise _too_large()
+            raise NotScalarError(_TOO_LARGE)
         parsed = json.loads(tree, object_hook=drop_places)
     except RecursionError:
-        raise _too_deep() from None
+        raise NotScalarError(_TOO_DEEP) from None
     except (Error, UnicodeError) as error:
         raise NotScalarError(str(error).partition("\n")[0]) from None
     if parsed["error"]:
@@ -249,7 +243,7 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
     if not isinstance(tree, dict) or "class" not in tree:
         return sum(_walk(part, depth, columns) for part in _parts(tree))
     if depth == MAX_NESTING:
-        raise _too_deep()
+        raise NotScalarError(_TOO_DEEP)
     _require_listed(tree)
     if tree["class"] == "COLUMN_REF":
         columns[tree["column_names"][0]] = None
@@ -314,5 +308,5 @@ def _is_qualified(node: dict[str, Any]) -> bool:
 
 
 def _quote(expression: object) -> str:
-    quoted = repr(str(expression)) if isinstance(expression, str) else repr(expression)
+    quoted = repr(str(expression) if isinstance(expression, str) else expression)
     return quoted if len(quoted) <= _MAX_QUOTED else f"{quoted[: _MAX_QUOTED - 1]}…"

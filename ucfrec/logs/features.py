@@ -15,7 +15,7 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
-from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
+from ucfrec.logs.mapping import FeatureTable, log_files
 from ucfrec.logs.sessions import ID_TABLES
 from ucfrec.logs.tables import (
     NOTHING,
@@ -23,6 +23,7 @@ from ucfrec.logs.tables import (
     WHOLE,
     Table,
     cast_timestamp,
+    first_and_more,
     is_integer,
     is_number,
     is_vector,
@@ -48,15 +49,8 @@ _MANY_LACKING: Final = 0.2
 """Share of the ids without a row above which a note says so."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Files of a feature table with the same columns."""
-
-    table: Table
-    key: Bound
-    first_by: str
-    features: dict[str, tuple[str, str]]
-    """Feature, without regard to case, to its (SQL, type)."""
+_Types = dict[str, tuple[str, Path]]
+"""Feature of a table, without regard to case, to its type and the first file that has it."""
 
 
 def load_features(
@@ -73,13 +67,16 @@ def load_features(
     """
     names = [f"{kind}_features_{number}" for number in range(len(tables))]
     for name, table in zip(names, tables, strict=True):
-        opened = open_tables(connection, log_files(table.files))
-        parts = [_read_part(connection, part, table, kind) for part in opened]
-        types = _find_common_types(parts, kind)
-        rows_of_parts = " UNION ALL ".join(_select_rows(part, types, id_type) for part in parts)
+        opened, types = open_tables(connection, log_files(table.files)), _Types()
+        parts = [_select_part(connection, part, table, kind, id_type, types) for part in opened]
+        values = "".join(
+            f", CAST(f{n} AS {'VARCHAR' if type_ == NOTHING else type_}) AS f{n}"
+            for n, (type_, _) in enumerate(types.values())
+        )
         with explain_errors(connection, opened):
             connection.execute(
-                f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
+                f"CREATE TABLE {name} AS SELECT id{values} FROM "
+                f"({' UNION ALL BY NAME '.join(parts)}) WHERE id IS NOT NULL"
             )
         counts = f"SELECT count(*), count(DISTINCT id) FROM {name}"
         ((rows, ids),) = connection.sql(counts).fetchall()
@@ -91,15 +88,27 @@ def load_features(
     return names
 
 
-def count_features(connection: duckdb.DuckDBPyConnection, name: str) -> dict[str, int]:
-    """How many columns of which kind a table of `load_features` has."""
-    kinds = Counter(kind for _, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:])
-    return {_KINDS[kind]: n for kind, n in kinds.items()}
+def count_features(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[FeatureTable], names: Sequence[str]
+) -> dict[str, dict[str, int]]:
+    """Of each feature table, how many columns of which kind it has; `names` of `load_features`."""
+    kinds = (connection.sql(f"DESCRIBE {name}").fetchall()[1:] for name in names)
+    return {
+        first_and_more([*map(Path, table.files)]): Counter(_KINDS[kind] for _, kind, *_ in columns)
+        for table, columns in zip(tables, kinds, strict=True)
+    }
 
 
-def _read_part(
-    connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
-) -> _Part:
+def _select_part(
+    connection: duckdb.DuckDBPyConnection,
+    opened: Table,
+    table: FeatureTable,
+    kind: str,
+    id_type: str,
+    types: _Types,
+) -> str:
+    """SQL of the rows of a part of a table: `id`, and of the features in `types`, to which it adds,
+    those that it has as `f0`, …."""
     key = bind(connection, opened, f"key of {kind} features", table.key)
     key_columns = {name.casefold() for name in key.columns}
     names = table.columns or tuple(
@@ -111,21 +120,33 @@ def _read_part(
     raw = key.columns if key.is_column and not opened.columnar else ()
     if raw:
         key = Bound(quote_name(raw_name(raw[0])), "VARCHAR", (), False)
-    sources, features, first_by = [key], {}, ""
+    id_sql, sources, values, first = _cast_id(key.sql, key.kind, id_type), [key], {}, ""
     for name in names:
-        feature = bind(connection, opened, f"{kind} feature", name)
+        feature, folded = bind(connection, opened, f"{kind} feature", name), name.casefold()
         comparable = _cast_feature(feature.sql, feature.kind)
         if comparable is None:
             remedy = "cast it to a number, text, or a list of either"
             raise wrong_type(opened, f"{kind} feature", name, feature.kind, remedy)
-        features[name.casefold()] = comparable
+        sql, type_ = comparable
+        earlier, file = types.get(folded, (NOTHING, opened.files[0]))
+        if earlier == NOTHING:
+            types[folded] = type_, opened.files[0]
+        elif type_ not in (earlier, NOTHING):
+            raise InputError(
+                f"{opened.files[0]}: {kind} feature {folded} is {type_} here and {earlier} in "
+                f"{file}; write it in one type"
+            )
+        values[f"f{list(types).index(folded)}"] = sql
         sources.append(feature)
     if table.first_by:
         order = bind(connection, opened, f"first_by of {kind} features", table.first_by)
         sources.append(order)
-        first_by = order.sql
+        # Ties are broken by the features, so that the order of rows does not matter.
+        ties = ", ".join([order.sql, *values.values()])
+        first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {ties}) = 1"
     columns = (column for source in sources for column in source.columns)
-    return _Part(opened.of(columns, raw), key, first_by, features)
+    features = "".join(f", {sql} AS {name}" for name, sql in values.items())
+    return f"SELECT {id_sql} AS id{features} FROM {opened.of(columns, raw).sql}{first}"
 
 
 def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
@@ -144,38 +165,6 @@ def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
     if kind.endswith("[]"):
         return f"CAST({sql} AS VARCHAR[])", "VARCHAR[]"
     return None
-
-
-def _find_common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
-    """Feature to its type, which all parts of a table that have it must agree on."""
-    types: dict[str, str] = {}
-    files: dict[str, Path] = {}
-    for part in parts:
-        for name, (_, type_) in part.features.items():
-            earlier = types.get(name, NOTHING)
-            if earlier == NOTHING:
-                types[name], files[name] = type_, part.table.files[0]
-            elif type_ not in (earlier, NOTHING):
-                raise InputError(
-                    f"{part.table.files[0]}: {kind} feature {name} is {type_} here and {earlier} "
-                    f"in {files[name]}; write it in one type"
-                )
-    return {name: "VARCHAR" if type_ == NOTHING else type_ for name, type_ in types.items()}
-
-
-def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
-    """SQL of the rows of a part: `id`, `f0`, …."""
-    id_sql, first = _cast_id(part.key.sql, part.key.kind, id_type), ""
-    columns = [
-        f"CAST({part.features.get(name, ('NULL', ''))[0]} AS {type_})"
-        for name, type_ in types.items()
-    ]
-    if part.first_by:
-        # Ties are broken by the features, so that the order of rows does not matter.
-        order = ", ".join([part.first_by, *columns])
-        first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
-    values = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
-    return f"SELECT {id_sql} AS id{values} FROM {part.table.sql}{first}"
 
 
 def _cast_id(key: str, key_type: str, id_type: str) -> str:
@@ -257,19 +246,6 @@ def note_lacking(
             )
 
 
-def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:
-    """Note a table called `items.*` or `users.*` beside the files of a log that was named alone."""
-    folders = dict.fromkeys(file.parent for file in files)
-    for name, tables in (("items", mapping.item_features), ("users", mapping.user_features)):
-        beside = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
-        table = next((file for file in beside if is_table(file) and file not in files), None)
-        if table is not None and not tables:
-            warn_user(
-                f"{table} lies beside the log and is not read; if it holds features of {name}, "
-                f"name the folder {table.parent}, or the file too"
-            )
-
-
 def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
     ((count,),) = connection.sql(f"SELECT count(*) FROM {rows}").fetchall()
     return int(count)
@@ -321,24 +297,31 @@ def encode_features(
     """
     from scipy import sparse  # takes a moment to import
 
-    count, blocks = _count(connection, ids), []
+    entries, width = [], 0
     for name in names:
         joined = f"{ids} JOIN {name} ON {ids}.{id_column} = {name}.id"
         for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]:
             if kind in ("DOUBLE", "FLOAT[]"):
                 vector = column if kind == "FLOAT[]" else f"[{column}]"
-                block = _encode_numbers(connection, joined, column, vector, count)
+                values, rows, columns, size = _encode_numbers(connection, joined, column, vector)
             else:
                 value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
-                block = _encode_categories(connection, joined, value, count)
-            if block.shape[1]:
-                blocks.append(block)
-    return sparse.hstack(blocks, format="csr", dtype=np.float32) if blocks else None
+                cases = f"SELECT number, train_count > 0 AS counts, {value} AS value FROM {joined}"
+                rows, columns = _rank_values(connection, cases, CATEGORIES)
+                values, size = np.ones(len(rows), np.float32), int(columns.max(initial=-1)) + 1
+            entries.append((values, rows, columns + width))
+            width += size
+    if not width:
+        return None
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    shape = (_count(connection, ids), width)
+    return sparse.coo_matrix((values, (rows, columns)), shape=shape).tocsr()
 
 
 def _encode_numbers(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, vector: str, count: int
-) -> "sparse.csr_matrix":
+    connection: duckdb.DuckDBPyConnection, joined: str, column: str, vector: str
+) -> tuple[Array, IntArray, IntArray, int]:
+    """Entries of a matrix: values, rows and columns, of which there are so many."""
     sizes = connection.sql(
         f"SELECT DISTINCT len({vector}) FROM {joined} WHERE {column} IS NOT NULL"
     ).fetchall()
@@ -352,40 +335,30 @@ def _encode_numbers(
     values = values.reshape(-1, sizes[0][0] if sizes else 1)
     numbers, training = rows["number"].to_numpy(), values[rows["trained"].to_numpy().astype(bool)]
     if not len(training):
-        return _fill(values[:0, :0], numbers[:0], numbers[:0], (count, 0))
+        return values[:0, 0], numbers[:0], numbers[:0], 0
     deviation = training.std(axis=0)
     varied = deviation > 0
     scaled = (values - training.mean(axis=0))[:, varied] / deviation[varied]
     scaled = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
     size = scaled.shape[1]
     columns = np.tile(np.arange(size), len(numbers))
-    return _fill(scaled, np.repeat(numbers, size), columns, (count, size))
+    return scaled.ravel(), np.repeat(numbers, size), columns, size
 
 
-def _encode_categories(
-    connection: duckdb.DuckDBPyConnection, joined: str, value: str, count: int
-) -> "sparse.csr_matrix":
+def _rank_values(
+    connection: duckdb.DuckDBPyConnection, cases: str, most: int
+) -> tuple[IntArray, IntArray]:
+    """The `number` of cases (SQL), in order, that have one of the most frequent values, at most
+    `most`, and the rank of the value, from 0 on; frequent where `counts` is true."""
     rows = connection.sql(f"""
-        WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
-        kept AS (
-            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS column_index
-            FROM cases WHERE train_count > 0 AND value IS NOT NULL
-            GROUP BY value ORDER BY column_index LIMIT {CATEGORIES}
+        WITH cases AS ({cases}),
+        ranked AS (
+            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS rank
+            FROM cases WHERE counts AND value IS NOT NULL GROUP BY value ORDER BY rank LIMIT {most}
         )
-        SELECT number, column_index FROM cases JOIN kept USING (value)
-        ORDER BY number, column_index
+        SELECT number, rank FROM cases JOIN ranked USING (value) ORDER BY number, rank
     """).fetchnumpy()
-    size = int(rows["column_index"].max(initial=-1)) + 1
-    ones = np.ones(len(rows["number"]), dtype=np.float32)
-    return _fill(ones, rows["number"], rows["column_index"], (count, size))
-
-
-def _fill(
-    values: Array, rows: Array, columns: Array, shape: tuple[int, int]
-) -> "sparse.csr_matrix":
-    from scipy import sparse
-
-    return sparse.coo_matrix((values.ravel(), (rows, columns)), shape=shape).tocsr()
+    return rows["number"].astype(np.int64), rows["rank"].astype(np.int64)
 
 
 def item_tags(
@@ -397,26 +370,17 @@ def item_tags(
     An item without any shares none.
     """
     cases = [
-        f"SELECT number, '{name}.{column}:' || unnest(list_distinct({column})) AS tag "
-        f"FROM items JOIN {name} ON items.{schema.ITEM_ID} = {name}.id"
+        f"SELECT number, true AS counts, '{name}.{column}:' || unnest(list_distinct({column})) "
+        f"AS value FROM items JOIN {name} ON items.{schema.ITEM_ID} = {name}.id"
         for name in names
         for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]
         if kind == "VARCHAR[]"
     ]
     if not cases:
         return np.zeros((n_items, 0), dtype=np.int64)
-    rows = connection.sql(f"""
-        WITH cases AS ({" UNION ALL ".join(cases)}),
-        tags AS (
-            SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
-            FROM cases WHERE tag IS NOT NULL GROUP BY tag
-            ORDER BY tag_number LIMIT {DISTINCT_TAGS}
-        )
-        SELECT number, tag_number,
-            row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
-        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
-    """).fetchnumpy()
-    places = rows["place"].astype(np.int64)
-    tags = np.full((n_items, int(places.max(initial=-1)) + 1), -1, dtype=np.int64)
-    tags[rows["number"].astype(np.int64), places] = rows["tag_number"]
+    numbers, ranks = _rank_values(connection, " UNION ALL ".join(cases), DISTINCT_TAGS)
+    places = np.arange(len(numbers)) - np.searchsorted(numbers, numbers)
+    size = min(int(places.max(initial=-1)) + 1, TAGS_PER_ITEM)
+    tags, few = np.full((n_items, size), -1, dtype=np.int64), places < size
+    tags[numbers[few], places[few]] = ranks[few]
     return tags

@@ -18,7 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors, settle_mapping
 from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
-from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
+from ucfrec.logs.rows import ITEM, SESSION, USER, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
 from ucfrec.logs.tables import Table, quote_name
 from ucfrec.logs.typed import LogTables, open_log, open_log_tables
@@ -168,7 +168,7 @@ def read_histories(
     files = log_files(paths)
     with (
         scratch_folder(Path(gettempdir()), "histories") as folder,
-        engine(files, folder, memory_limit, shared=True) as connection,
+        engine(files, folder, memory_limit) as connection,
     ):
         tables = open_log_tables(connection, files, mapping, reward, session_by)
         yield from _read_users(tables, last, duplicates, folder)
@@ -272,42 +272,36 @@ def _read_users(
     """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
     log = open_log(tables)
     log.require_items()
+    by_session = log.session_by == schema.SESSION_ID
     with explain_errors(log.connection, log.tables):
-        rows = sort_rows(log, None, duplicates, folder)
-        require_rows(log, rows.count, rows.dropped)
-        note_dropped(log.name, rows.dropped, rows.read)
+        sorted_rows = sort_rows(log, None, duplicates, folder)
+        observations = sorted_rows.observations
+        require_rows(log, sorted_rows.count, sorted_rows.dropped)
+        note_dropped(log.name, sorted_rows.dropped, sorted_rows.read)
         query = f"SELECT {schema.ITEM_ID} FROM item_codes ORDER BY code"
         items = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
-        for batch in rows.file.read():
-            yield _gather_histories(rows, batch, items, last)
-
-
-def _gather_histories(
-    sorted_rows: SortedRows, rows: dict[str, Array], items: Array, last: int
-) -> Histories:
-    """The users of rows, which are all theirs."""
-    log, codes = sorted_rows.log, rows[USER]
-    first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-    ends = np.append(first[1:], len(codes))
-    owner = np.repeat(np.arange(len(first)), ends - first)
-    recent = ends[owner] - np.arange(len(codes)) <= last
-    query = (
-        f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "
-        "ORDER BY code"
-    )
-    users = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
-    # Codes of items are in the order of their ids.
-    seen_owner, seen = np.divmod(np.unique(owner * len(items) + rows[ITEM]), len(items))
-    by_session, observations = log.session_by == schema.SESSION_ID, sorted_rows.observations
-    newest = rows["row"][ends - 1]
-    return Histories(
-        users=users[codes[first].astype(np.int64) - codes[0]],
-        owner=owner[recent],
-        item_ids=items[rows[ITEM][recent]],
-        rewards=rows[schema.REWARD][recent].astype(np.float32),
-        timestamps=rows[schema.TIMESTAMP][recent].astype(np.int64),
-        session_ids=rows[SESSION][recent] if by_session else None,
-        seen_owner=seen_owner,
-        seen_ids=items[seen],
-        observations=None if observations is None else observations.of_rows(newest),
-    )
+        for rows in sorted_rows.file.read():
+            codes = rows[USER]
+            query = (
+                f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND "
+                f"{codes[-1]} ORDER BY code"
+            )
+            users = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
+            first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+            ends = np.append(first[1:], len(codes))
+            owner = np.repeat(np.arange(len(first)), ends - first)
+            recent = ends[owner] - np.arange(len(codes)) <= last
+            # Codes of items are in the order of their ids.
+            seen_owner, seen = np.divmod(np.unique(owner * len(items) + rows[ITEM]), len(items))
+            newest = rows["row"][ends - 1]
+            yield Histories(
+                users=users[codes[first].astype(np.int64) - codes[0]],
+                owner=owner[recent],
+                item_ids=items[rows[ITEM][recent]],
+                rewards=rows[schema.REWARD][recent].astype(np.float32),
+                timestamps=rows[schema.TIMESTAMP][recent].astype(np.int64),
+                session_ids=rows[SESSION][recent] if by_session else None,
+                seen_owner=seen_owner,
+                seen_ids=items[seen],
+                observations=None if observations is None else observations.of_rows(newest),
+            )

@@ -206,24 +206,21 @@ class SparseRows:
 
     def __init__(self, path: Path, n_columns: int) -> None:
         self._file: IO[bytes] = path.open("w+b")
-        self._blocks: list[tuple[int, int]] = []
+        self._lengths: list[int] = []
         self.shape = (0, n_columns)
 
     def append(self, rows: sparse.csr_matrix) -> None:
         """Append rows with float32 values."""
-        for array, dtype in ((rows.indptr, "<i8"), (rows.indices, "<i4"), (rows.data, "<f4")):
-            self._file.write(np.ascontiguousarray(array, dtype=dtype).data)
-        self._blocks.append((rows.shape[0], rows.nnz))
+        for array in (rows.data.astype(np.float32), rows.indices, rows.indptr):
+            np.save(self._file, array)
+        self._lengths.append(rows.shape[0])
         self.shape = (self.shape[0] + rows.shape[0], self.shape[1])
 
     def blocks(self) -> Iterator[sparse.csr_matrix]:
         self._file.seek(0)
-        for rows, values in self._blocks:
-            starts = np.fromfile(self._file, "<i8", rows + 1)
-            columns = np.fromfile(self._file, "<i4", values)
-            data = np.fromfile(self._file, "<f4", values)
-            index = starts.astype(np.int32) if values < 2**31 else starts
-            yield sparse.csr_matrix((data, columns, index), shape=(rows, self.shape[1]))
+        for rows in self._lengths:
+            parts = tuple(np.load(self._file) for _ in range(3))
+            yield sparse.csr_matrix(parts, shape=(rows, self.shape[1]))
 
 
 def right_singular_vectors(
@@ -280,9 +277,6 @@ def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64A
     """Square roots of the largest eigenvalues, descending, 0 for rounding errors; eigenvectors."""
     values, vectors = np.linalg.eigh(symmetric)
     values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
-    missing = max(0, rank - len(values))
-    values = np.pad(values, (0, missing))
-    vectors = np.pad(vectors, ((0, 0), (0, missing)))
     values = np.where(values > _SMALL * max(values[0], 0), values, 0)
     return np.sqrt(values), np.where(values > 0, vectors, 0)
 

@@ -1,6 +1,6 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
@@ -113,7 +113,7 @@ def join_feedback(
     files = [*shown_files, *feedback_files]
     require_other_files([out], files)
     mapping = mapping or LogMapping()
-    with engine(files, Path(gettempdir()), memory_limit, shared=True) as connection:
+    with engine(files, Path(gettempdir()), memory_limit) as connection:
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
         with explain_errors(connection, (*shown_tables, *tables), out.parent):
@@ -134,24 +134,17 @@ def join_feedback(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
                 "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
             ).fetchall()
-            unmatched = rows - matched
-            joined = Joined(
-                exposure_rows, written - exposure_rows, with_feedback, matched, unmatched, columns
-            )
+            repeated, unmatched = written - exposure_rows, rows - matched
+            joined = Joined(exposure_rows, repeated, with_feedback, matched, unmatched, columns)
             if unmatched >= MANY * rows > 0 or not matched:
                 warn_user(_why_unmatched(connection, joined))
             return joined
 
 
-@dataclass(frozen=True)
-class _Further:
-    """A further column of the exposures, as those of a log that was joined before."""
-
-    name: str
-    alias: str
-    """Its name in the table `exposures`, so that any name is possible."""
-    is_number: bool
-    """Or a truth value, in all files that have it."""
+_Further = dict[str, tuple[str, bool]]
+"""Further columns of the exposures, as those of a log that was joined before, by their name in
+lower case: name, and whether they hold numbers or truth values in all files that have them. Their
+names in the table `exposures` are more_0, …, so that any name is possible."""
 
 
 def _names_of(table: Table) -> dict[str, str]:
@@ -163,9 +156,7 @@ def _holds_feedback(kind: str) -> bool:
     return is_number(kind) or kind == "BOOLEAN"
 
 
-def _make_exposures(
-    connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]
-) -> dict[str, _Further]:
+def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]) -> _Further:
     """Create the table `exposures`, each once, with its `row`; returns its further columns."""
     for table in tables:
         missing = [name for name in _EXPOSURE if name not in {*_names_of(table), schema.ARM}]
@@ -175,13 +166,12 @@ def _make_exposures(
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
     typed = type_columns(LogTables(connection, tables, _keys_of(LogMapping()), "0", "user"))
-    further: dict[str, _Further] = {}
+    further: _Further = {}
     for table in tables:
         for key, name in _names_of(table).items():
-            if key not in {*typed.names, *_EXPOSURE}:
-                column = further.get(key) or _Further(name, f"more_{len(further)}", True)
-                number = column.is_number and _holds_feedback(table.columns[name])
-                further[key] = replace(column, is_number=number)
+            if key not in {*typed.columns, *_EXPOSURE}:
+                first, is_number = further.get(key, (name, True))
+                further[key] = first, is_number and _holds_feedback(table.columns[name])
     rows = " UNION ALL BY NAME ".join(
         f"SELECT {keys}, {_select_others(whole, narrow, further)}"
         for whole, narrow, keys in zip(tables, typed.tables, typed.selects, strict=True)
@@ -195,22 +185,21 @@ def _make_exposures(
     return further
 
 
-def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -> str:
+def _select_others(table: Table, keys: Table, further: _Further) -> str:
     """SQL of the columns of exposures besides the `keys` that a table has, and of its rows."""
-    values, columns, texts = {schema.ARM: "''"}, [], []
-    for key, name in _names_of(table).items():
-        if _OTHERS.get(key) == "VARCHAR":
-            texts.append(name)
-            value = table.text_of(name)
-            values[key] = f"coalesce({value}, '')" if key == schema.ARM else value
-        elif key in _OTHERS or key in further:
-            columns.append(name)
-            is_other = key in _OTHERS
-            values[key if is_other else further[key].alias] = (
-                f"CAST({quote_name(name)} AS {_OTHERS[key]})" if is_other else quote_name(name)
-            )
+    names, values, texts = _names_of(table), {schema.ARM: "''"}, []
+    more = {key: f"more_{n}" for n, key in enumerate(further) if key in names}
+    for name, kind in _OTHERS.items():
+        if name in names and kind == "VARCHAR":
+            texts.append(names[name])
+            absent = "''" if name == schema.ARM else "NULL"
+            values[name] = f"coalesce({table.text_of(names[name])}, {absent})"
+        elif name in names:
+            values[name] = f"CAST({quote_name(names[name])} AS {kind})"
+    values |= {alias: quote_name(names[key]) for key, alias in more.items()}
+    columns = [name for key, name in names.items() if key in more or key in _OTHERS]
     selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
-    return f"{selects} FROM {keys.with_texts(columns, texts).sql}"
+    return f"{selects} FROM {keys.with_texts([n for n in columns if n not in texts], texts).sql}"
 
 
 def _make_feedback(
@@ -320,25 +309,28 @@ def _keys_of(mapping: LogMapping) -> LogMapping:
 def _write(
     connection: duckdb.DuckDBPyConnection,
     columns: Sequence[str],
-    further: Mapping[str, _Further],
+    further: _Further,
     out: Path,
 ) -> None:
     """Write the log, users as numbers if the feedback has numbers."""
     values = {FEEDBACK: FEEDBACK, **{name: f"value_{n}" for n, name in enumerate(columns)}}
     largest = "".join(f", max(value_{n}) AS value_{n}" for n in range(len(columns)))
+    earlier = {key: f"more_{n}" for n, key in enumerate(further)}
     again = {name.casefold() for name in values}
     selects = [
-        f"{c.alias} AS {quote_name(c.name)}" for key, c in further.items() if key not in again
+        f"{earlier[key]} AS {quote_name(name)}"
+        for key, (name, _) in further.items()
+        if key not in again
     ]
     for name, value in values.items():
-        both, earlier = [value], further.get(name.casefold())
-        if earlier is not None and earlier.is_number:
-            both.append(f"nullif(CAST({earlier.alias} AS DOUBLE), 0)")
+        both, key = [value], name.casefold()
+        if key in further and further[key][1]:
+            both.append(f"nullif(CAST({earlier[key]} AS DOUBLE), 0)")
         # Neither `list_sum` nor `list_max` counts what is missing.
         sql = f"list_{'sum' if name == FEEDBACK else 'max'}([{', '.join(both)}])"
         kind = "BIGINT" if name == FEEDBACK else "DOUBLE"
         selects.append(f"CAST(coalesce({sql}, 0) AS {kind}) AS {quote_name(name)}")
-    internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
+    internal = "user_id", "row", *values.values(), *earlier.values()
     ((whole,),) = connection.sql(
         "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
         "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
@@ -359,18 +351,19 @@ def _write(
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:
     """What may be wrong with feedback of which few rows match."""
-    ((requests, equal, request, other_request, users, midnight),) = connection.sql(
-        f"SELECT count({_REQUEST}), "
-        f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), min({_REQUEST}), "
-        f"(SELECT min({_REQUEST}) FROM exposures), "
-        f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
-        f"coalesce(bool_and(timestamp % {_DAY_MS} = 0), false) FROM feedback"
-    ).fetchall()
     # As a number where no calendar has it.
-    first, last = (
-        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
-        f"CAST({time} AS VARCHAR), '(none)')"
-        for time in ("first", "last")
+    span = " || ' to ' || ".join(
+        f"coalesce({end}(TRY(strftime(make_timestamp_ms(timestamp), '%Y-%m-%d %H:%M:%S'))), "
+        f"CAST({end}(timestamp) AS VARCHAR), '(none)')"
+        for end in ("min", "max")
+    )
+    ((requests, equal, request, given_at, midnight, users, other_request, shown_at),) = (
+        connection.sql(
+            f"SELECT count({_REQUEST}), count_if({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)),"
+            f" min({_REQUEST}), {span}, coalesce(bool_and(timestamp % {_DAY_MS} = 0), false), "
+            f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
+            f"(SELECT min({_REQUEST}) FROM exposures), (SELECT {span} FROM exposures) FROM feedback"
+        ).fetchall()
     )
     reasons = []
     if requests and not equal:
@@ -383,13 +376,6 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         reasons.append(
             "none of its users was shown any of their items, check --column user_id and item_id"
         )
-    shown_at, given_at = (
-        connection.sql(
-            f"SELECT {first} || ' to ' || {last} FROM "
-            f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
-        ).fetchall()[0][0]
-        for rows in ("exposures", "feedback")
-    )
     reasons.append(
         f"exposures are from {shown_at} and feedback from {given_at} (UTC), where "
         "numbers are read as milliseconds: seconds need --column timestamp='COLUMN * 1000', "

@@ -2,11 +2,12 @@
 
 import glob
 import hashlib
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Final, get_args
+from typing import Any, Final, get_args
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
@@ -353,8 +354,7 @@ def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
 
 def _unpack(name: str, release: Release, folder: Path) -> Path:
     """The folder with the files of a release."""
-    import tarfile  # with zipfile, only for this
-    import zipfile
+    import zipfile  # only for this
 
     target = folder / name
     if target.is_dir():
@@ -371,13 +371,9 @@ def _unpack(name: str, release: Release, folder: Path) -> Path:
             "version: delete it and load it again"
         )
     with atomic_folder(target) as scratch:
-        if zipfile.is_zipfile(archive):
-            with zipfile.ZipFile(archive) as content:
-                content.extractall(scratch)
-        else:
-            with tarfile.open(archive) as content:
-                # Names that lead elsewhere, links out of the folder and devices are refused.
-                content.extractall(scratch, filter="data")
+        # Of a tar, names that lead elsewhere, links out of the folder and devices are refused.
+        how: dict[str, Any] = {} if zipfile.is_zipfile(archive) else {"filter": "data"}
+        shutil.unpack_archive(archive, scratch, **how)
         if release.convert is not None:
             release.convert(scratch)
     return target

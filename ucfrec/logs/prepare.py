@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import pyarrow as pa
 from pydantic import Field, InstanceOf
@@ -28,15 +28,16 @@ from ucfrec.logs.features import (
     encode_ids,
     feature_digest,
     load_features,
-    note_unread_features,
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
-from ucfrec.logs.tables import first_and_more
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
+
+_REMEMBERED: Final = ("duplicates", "dataset", "min_steps", "max_session")
+"""Options that the record of a store has."""
 
 
 @settings_table("")
@@ -137,10 +138,6 @@ def prepare(
     exists, or the disk is full.
     """
     options, out = options or PrepareOptions(), Path(out)
-    if hasattr(paths, "columns"):
-        raise InputError(
-            "paths is a frame; give log files, folders or globs here, and frames to Recommender.fit"
-        )
     files = log_files(paths)
     if like is not None and not (like / sessions.USERS_FILE).is_file():
         raise InputError(
@@ -223,10 +220,10 @@ def read_log(
         file for tables in tables_of_ids.values() for t in tables for file in log_files(t.files)
     ]
     id_files = [store / file for _, _, file in sessions.ID_TABLES] if store else []
-    inputs = (*files, *(file for file in id_files if file.is_file()), *feature_files)
+    inputs = (*files, *id_files, *feature_files)
     with (
         scratch_folder(spill, "sorted") as scratch,
-        engine(inputs, spill, options.memory_limit, shared=True) as connection,
+        engine(inputs, spill, options.memory_limit) as connection,
     ):
         with progress(4, "check the logs", "stages") as stage:
             opened = open_log_tables(connection, files, mapping, reward, session_by)
@@ -249,14 +246,14 @@ def read_log(
                 summary.note_losses(rows, reward, mapping.where)
                 if store is None:
                     summary.require_variety(rows)
-                    note_unread_features(files, mapping)
                 stage.update()
-                bounds = sessions.split_bounds(
-                    rows, (1.0, 0.0, 0.0) if evaluates else options.split
-                )
-                gap_ms = round(options.gap_minutes * 60_000)
+                split = (1.0, 0.0, 0.0) if evaluates else options.split
                 cut = sessions.Cut(
-                    log.session_by, gap_ms, options.min_steps, bounds, options.max_session
+                    log.session_by,
+                    round(options.gap_minutes * 60_000),
+                    options.min_steps,
+                    sessions.split_bounds(rows, split),
+                    options.max_session,
                 )
                 counts = sessions.count_steps(rows, cut)
                 stage.update()
@@ -268,24 +265,15 @@ def read_log(
                 sessions.number_ids(log, features, store, grows)
                 report = {"reward": reward, **summary.build_report(rows, cut, counts)}
                 summary.note_oddities(rows, report, mapping)
-                if store is None and len(options.split) == 2:
-                    summary.note_empty_splits(rows, report)
                 stage.update()
                 for name, names in features.items():
-                    tables = tables_of_ids[name]
-                    require_known_ids(connection, tables, names, name, noted=not grows)
+                    require_known_ids(connection, tables_of_ids[name], names, name, not grows)
+                report |= {name: getattr(options, name) for name in _REMEMBERED}
                 report |= {
-                    "duplicates": options.duplicates,
-                    "dataset": options.dataset,
                     **mapping.remember(),
-                    "min_steps": options.min_steps,
-                    "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
                     "feature_tables": {
-                        name: {
-                            first_and_more([*map(Path, t.files)]): count_features(connection, rows)
-                            for t, rows in zip(tables_of_ids[name], names, strict=True)
-                        }
+                        name: count_features(connection, tables_of_ids[name], names)
                         for name, names in features.items()
                     },
                 }

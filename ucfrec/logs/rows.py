@@ -13,7 +13,6 @@ import io
 import mmap
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -42,14 +41,6 @@ FAULTY: Final = "faulty"
 HELD: Final = "held"
 """Relation of rows that a store has already."""
 FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
-DUPLICATES: Final = {
-    "highest": "has the highest",
-    "lowest": "has the lowest",
-    "first": "comes first in the files",
-    "last": "comes last in the files",
-}
-"""Which of several rows with the same user, item or action, and time is kept: rule to its
-description."""
 PRIME: Final = 2**31 - 1
 USER_FACTOR: Final = 7919
 HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
@@ -78,16 +69,15 @@ class RowVectors:
 
     def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
         """Write to a file, or to memory, batches of `row`, from 1 on, and `observation`."""
-        rows, self._file, memory = 0, file, io.BytesIO()
-        with memory if file is None else file.open("xb") as out:
+        rows, self._file = 0, file
+        with io.BytesIO() if file is None else file.open("xb") as out:
             for batch in batches:
                 places = to_numpy(batch.column("row"))
                 # What is at the place of a row must be its own: the engine keeps their order.
                 assert np.array_equal(places, np.arange(rows + 1, rows + 1 + len(places)))
-                values = to_numpy(batch.column(schema.OBSERVATION).flatten())
-                out.write(np.ascontiguousarray(values).data)
+                out.write(to_numpy(batch.column(schema.OBSERVATION)).tobytes())
                 rows += len(places)
-            self._memory = memory.getvalue()
+            self._memory = out.getvalue() if isinstance(out, io.BytesIO) else b""
         self._shape = rows, size
 
     def of_rows(self, rows: IntArray) -> Float32Array:
@@ -111,32 +101,24 @@ class RowFile:
         if folder is not None:
             folder.mkdir()
         self._folder = folder
-        self._memory: list[dict[str, Array]] = []
-        self._batches = 0
+        self._batches: list[dict[str, Array]] = []
+        """In memory; with a folder, their columns have no values."""
 
     def append(self, batch: dict[str, Array]) -> None:
         """Append rows, the same columns every time."""
-        self._batches += 1
-        if self._folder is None:
-            self._memory.append(batch)
-            return
-        for name, values in batch.items():
-            with (self._folder / name).open("ab") as file:
-                np.save(file, values)
+        if self._folder is not None:
+            for name, values in batch.items():
+                np.save(self._folder / f"{len(self._batches)}-{name}.npy", values)
+            batch = dict.fromkeys(batch, np.empty(0))
+        self._batches.append(batch)
 
     def read(self, *names: str) -> Iterator[dict[str, Array]]:
         """Some columns of the batches, or all, in order."""
-        if self._folder is None or not self._batches:
-            yield from self._memory
-            return
-        with ExitStack() as stack:
-            files = {
-                path.name: stack.enter_context(path.open("rb"))
-                for path in self._folder.iterdir()
-                if path.name in names or not names
-            }
-            for _ in range(self._batches):
-                yield {name: np.load(file) for name, file in files.items()}
+        for number, batch in enumerate(self._batches):
+            if self._folder is not None:
+                files = {name: self._folder / f"{number}-{name}.npy" for name in names or batch}
+                batch = {name: np.load(file) for name, file in files.items()}
+            yield batch
 
 
 @dataclass
@@ -246,16 +228,6 @@ def keep_users_whole(batches: Iterable[dict[str, Array]], user: str) -> Iterator
         yield pending
 
 
-def _read_columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
-    columns = {}
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        size = log.vector_size.get(name)
-        columns[name] = (
-            to_numpy(column) if size is None else to_numpy(column.flatten()).reshape(-1, size)
-        )
-    return columns
-
-
 def sort_rows(
     log: TypedLog,
     known_items: Path | None,
@@ -267,7 +239,7 @@ def sort_rows(
     """Sort the rows of a log with DuckDB.
 
     Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
-    `duplicates` is a key of `DUPLICATES`, `folder` for scratch (None for a log in memory). With
+    `duplicates` is as of `PrepareOptions`, `folder` for scratch (None for a log in memory). With
     `by_session`, the rows of a session follow each other. Rows whose user, item and time are those
     of a row of `held` (ids are text) are duplicates. Raises InputError if a reward is too
     large to train with.
@@ -311,10 +283,10 @@ def mark_faults(log: TypedLog, rows: str, known_items: Path | None, any_held: bo
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS
-    conditions = {"left_out": f"NOT {WANTED}"} if log.has_condition else {}
+    conditions = {"left_out": f"NOT {WANTED}"} if log.mapping.where is not None else {}
     conditions |= {
         "null_key": " OR ".join(f"{key} IS NULL" for key in keys if key != schema.ACTION),
-        "clock_out_of_range": f"{schema.TIMESTAMP} NOT BETWEEN {log.earliest_ms} AND {latest}",
+        "clock_out_of_range": f"timestamp NOT BETWEEN {log.mapping.earliest_ms} AND {latest}",
     }
     if schema.ACTION in log.vector_size:
         conditions["vector_not_finite"] = not_finite(schema.ACTION)
@@ -329,7 +301,7 @@ def mark_faults(log: TypedLog, rows: str, known_items: Path | None, any_held: bo
     cases = " ".join(
         f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
     )
-    columns = [f"* EXCLUDE ({WANTED})" if log.has_condition else "*"]
+    columns = [f"* EXCLUDE ({WANTED})" if log.mapping.where is not None else "*"]
     if log.key == schema.ACTION:
         text = f"md5(CAST({schema.ACTION} AS VARCHAR))"
         columns.append(f"CAST('0x' || left({text}, 7) AS BIGINT) AS action_hash")
@@ -393,8 +365,13 @@ def check_sorted(
         {reason: fault_counts.get(number, 0) for number, reason in enumerate(REASONS, 1)},
         sum(fault_counts.values()),
     )
-    for columns in keep_users_whole((_read_columns(batch, log) for batch in batches), USER):
-        rows.add(columns, duplicates, by_session)
+    shapes = {name: (-1, size) for name, size in log.vector_size.items()}
+    columns = (
+        {n: to_numpy(batch.column(n)).reshape(shapes.get(n, -1)) for n in batch.schema.names}
+        for batch in batches
+    )
+    for users in keep_users_whole(columns, USER):
+        rows.add(users, duplicates, by_session)
     if rows.large:
         raise InputError(
             f"{log.tables[0].files[0]}: {rows.large:,} of {rows.count:,} rewards are beyond "

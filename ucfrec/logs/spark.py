@@ -22,7 +22,7 @@ from itertools import chain
 from math import ceil
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -48,17 +48,18 @@ from ucfrec.logs.summary import NoRowsError, note_dropped, require_rows
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
+    VECTORS,
     LogTables,
     TypedLog,
-    describe_log,
+    measure_vectors,
     number_rows,
     open_log_tables,
     survey_vectors,
     type_columns,
 )
 
-MEMORY: Final = "1GB"
-"""Memory of DuckDB in a task."""
+MEMORY: Final = "2GB"
+"""Memory of the process of a task."""
 PART_ROWS: Final = 1_000_000
 """About so many rows are a part; a user's rows are never in two."""
 _TYPES: Final = {
@@ -79,14 +80,12 @@ Work = Callable[[int, Path, LogMapping], int]
 have the columns of the schema and `reward`."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """A query over one file of a log."""
+class Task(NamedTuple):
+    """A query over one file of a log, and perhaps more files."""
 
     table: Table
     query: str
     more_files: tuple[Path, ...] = ()
-    """Other files that the query reads."""
 
 
 def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
@@ -109,7 +108,7 @@ def sort_with_spark(
     Every worker sees the folder `scratch`; `master` is Spark's, e.g. "local[*]" or
     "spark://host:7077". Raises InputError also if Spark is missing or fails.
     """
-    with spark_session(master) as spark, explain_spark():
+    with spark_session(master) as spark:
         log, rows = _type_rows(spark, tables, known_items, scratch)
         rows.createOrReplaceTempView(FAULTY)
         for name, table in code_tables(log).items():
@@ -138,20 +137,20 @@ def _type_rows(
     """The log, and a Spark frame of its rows as of `mark_faults`, read from files in `scratch`."""
     typed = type_columns(tables)
     with explain_errors(tables.connection, tables.tables):
-        every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
+        every = zip(typed.selects, typed.tables, strict=True)
         tables.connection.execute(f"CREATE VIEW {ROWS} AS {number_rows(every)}")
     files = [
-        (single := replace(table, files=(file,)), f"({number_rows([(values, single.sql)])})")
+        (single := replace(table, files=(file,)), f"({number_rows([(values, single)])})")
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
     surveys = [
-        Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.names, rows)})")
+        Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.columns, rows)})")
         for n, (file, rows) in enumerate(files)
     ]
-    columns = f"file bigint, {schema.ACTION} bigint, {schema.OBSERVATION} bigint, n bigint"
-    survey = _run(spark, surveys, f"{columns}, bad bigint").collect()
-    log = describe_log(tables, typed, [row[1:] for row in survey])
+    names = ("file", *(f"{end}_{v}" for v in VECTORS for end in ("min", "max")), "n", "bad")
+    survey = _run(spark, surveys, ", ".join(f"{name} bigint" for name in names)).collect()
+    log = measure_vectors(typed, [row[1:] for row in survey])
     tasks, rows_before = [], 0
     for number, (file, rows) in enumerate(files):
         faulty = mark_faults(log, rows, known_items)
@@ -222,7 +221,6 @@ def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[in
         scratch_folder(folder.absolute(), "users") as scratch,
         engine(files, scratch) as connection,
         spark_session(master) as spark,
-        explain_spark(),
     ):
         tables = open_log_tables(
             connection, files, source.mapping, source.reward, source.session_by
@@ -273,8 +271,10 @@ def _work_on_part(
 @contextmanager
 def spark_session(master: str) -> Iterator[Any]:
     """A session of Spark of its own; its cluster connection is kept if the program had one before.
-    Raises InputError if pyspark or Java is missing, or the master does not answer."""
+    Raises InputError if pyspark or Java is missing, the master does not answer, or Spark fails or a
+    worker refuses something in the block."""
     try:
+        from py4j.protocol import Py4JError
         from pyspark.errors import PySparkException
         from pyspark.sql import SparkSession
     except ImportError:
@@ -299,22 +299,12 @@ def spark_session(master: str) -> Iterator[Any]:
             # Its doubts about a version of pandas do not concern Arrow, which is used here.
             warnings.filterwarnings("ignore", category=FutureWarning, module="pyspark")
             yield started.newSession()
+    except (PySparkException, Py4JError) as error:
+        if refused := _REFUSED.search(str(error)):
+            raise InputError(refused[1]) from None
+        raise InputError(f"Spark failed ({one_line(str(error)):.500}); its log says more") from None
     finally:
         if running is None:
             started.stop()
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, interrupted)  # Spark's own would look for its session
-
-
-@contextmanager
-def explain_spark() -> Iterator[None]:
-    """Turn errors of Spark that occur in the block, and refusals of workers, into `InputError`."""
-    from py4j.protocol import Py4JError
-    from pyspark.errors import PySparkException
-
-    try:
-        yield
-    except (PySparkException, Py4JError) as error:
-        if refused := _REFUSED.search(str(error)):
-            raise InputError(refused[1]) from None
-        raise InputError(f"Spark failed ({one_line(str(error)):.500}); its log says more") from None

@@ -18,14 +18,13 @@ from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind, text_of_column
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
-from ucfrec.logs.rows import DUPLICATES, REASONS, SortedRows, mix_bits
+from ucfrec.logs.rows import REASONS, SortedRows, mix_bits
 from ucfrec.logs.sessions import (
     EPISODES,
     FEW_VALUES,
     USED_ITEMS,
     USED_USERS,
     Cut,
-    Moments,
     StepCounts,
     read_episodes,
 )
@@ -75,6 +74,9 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         f"SELECT count(*) FILTER (begins_session), count(*) FILTER (NOT terminated) FROM {EPISODES}"
     )
     users, censored = log.one(f"SELECT count(*), count(*) FILTER (NOT ended) FROM {USED_USERS}")
+    (return_to_go, both), (_, ahead) = counts.returns.covariance
+    # What is left of the rounding errors of equal returns is not variance.
+    varies = return_to_go > 1e-24 * counts.returns.mean[0] ** 2 and ahead
     report: dict[str, Any] = {
         "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
@@ -95,7 +97,7 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "sessions": sessions,
         "sessions_cut": unfinished - censored,
         "sessions_censored": censored,
-        "return_length_share": _explain_returns(counts.returns),
+        "return_length_share": float(both**2 / (return_to_go * ahead)) if varies else None,
         "users": users,
         "splits": splits,
         "time_range_ms": [counts.first_ms, counts.last_ms],
@@ -111,16 +113,6 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
     if schema.PROPENSITY in log.columns:
         report["unknown_propensities"] = counts.unknown_propensities
     return report
-
-
-def _explain_returns(returns: Moments) -> float | None:
-    """Share of the variance of training returns-to-go, of the whole rest of the session, that the
-    number of steps left explains; None if either does not vary."""
-    (return_to_go, both), (_, ahead) = returns.covariance
-    # What is left of the rounding errors of equal returns is not variance.
-    if return_to_go <= 1e-24 * returns.mean[0] ** 2 or not ahead:
-        return None
-    return float(both**2 / (return_to_go * ahead))
 
 
 def _measure_distributions(
@@ -183,55 +175,52 @@ def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution
 
 def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
     """Quantiles, each one of the ascending values, of which there are `counts`."""
-    cumulative = np.cumsum(counts)
-    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
-    chosen = values[np.searchsorted(cumulative, ranks)].tolist()
+    chosen = np.quantile(values, QUANTILES, weights=counts, method="inverted_cdf").tolist()
     return {f"{share:g}": value for share, value in zip(QUANTILES, chosen, strict=True)}
 
 
 def format_report(report: Mapping[str, Any]) -> str:
     """The report of `prepare` as a text table with one count per line."""
+    rule, session_by = report.get("duplicates", "highest"), report["session_by"]
+    counts = [
+        (f"  dropped: {reason}", rows, f"  {REASONS.get(reason, '')}")
+        for reason, rows in report["dropped"].items()
+    ]
+    conflicts = f"  duplicates with a different reward from the kept row, the {rule}"
+    counts += [
+        ("  conflicting duplicates", report["conflicting_duplicates"], conflicts),
+        ("  at equal times", report["equal_times"], " (in no order that could be learned)"),
+        ("  out of order", report["unsorted_rows"], " (sorted, none dropped)"),
+        ("steps kept", report["steps"], ""),
+        ("users", report["users"], ""),
+        ("items", report.get("items"), ""),
+        ("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite"),
+        ("sessions", report["sessions"], f" by {session_by}"),
+        ("  cut at a split", report["sessions_cut"], ""),
+        ("  censored", report.get("sessions_censored"), "  may have gone on after the log ended"),
+    ]
     lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
-    for reason, rows in report["dropped"].items():
-        if rows:
-            lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
-
-    def add(label: str, n: int | None, text: str = "", always: bool = False) -> None:
-        if n or always:
-            lines.append((label, f"{n:,}{text}"))
-
-    rule = DUPLICATES[report.get("duplicates", "highest")]
-    conflicts = f"  duplicates with a different reward from the kept row, which {rule}"
-    add("  conflicting duplicates", report["conflicting_duplicates"], conflicts)
-    add("  at equal times", report["equal_times"], " (in no order that could be learned)")
-    add("  out of order", report["unsorted_rows"], " (sorted, none dropped)", always=True)
-    add("steps kept", report["steps"], always=True)
-    add("users", report["users"], always=True)
-    add("items", report.get("items"))
-    add("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite")
-    add("sessions", report["sessions"], f" by {report['session_by']}", always=True)
-    add("  cut at a split", report["sessions_cut"])
-    censored = "  may have gone on after the log ended"
-    add("  censored", report.get("sessions_censored"), censored)
+    lines += [(label, f"{n:,}{text}") for label, n, text in counts if n or "out of" in label]
     lines += [
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
     ]
-    for name, tables in report.get("feature_tables", {}).items():
-        for file, kinds in tables.items():
-            columns = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no columns"
-            lines.append((f"{name} features", f"{columns} from {one_line(file)}"))
+    lines += [
+        (f"{name} features", f"{', '.join(f'{n} {kind}' for kind, n in kinds.items())} from {file}")
+        for name, tables in report.get("feature_tables", {}).items()
+        for file, kinds in tables.items()
+    ]
     lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
     if (share := report.get("return_length_share")) is not None:
         ahead = f"{share:.0%} of its variance is the number of steps left"
-        if report["session_by"] == "user":
+        if session_by == "user":
             ahead += ", which is random where sessions are users: policies learn the next step's"
         lines.append(("return-to-go", ahead))
     statistics = report["reward_statistics"].items()
     figures = ", ".join(f"{name} {value:.4g}" for name, value in statistics)
-    lines.append(("reward", f"{one_line(report['reward'])}: {figures}"))
+    lines.append(("reward", f"{report['reward']}: {figures}"))
     width = max(len(name) for name, _ in lines) + 2
-    return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
+    return "\n".join(one_line(f"{name:<{width}}{value}").rstrip() for name, value in lines)
 
 
 def format_summary(report: Mapping[str, Any]) -> str:
@@ -262,12 +251,12 @@ def require_rows(
         return
     n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
     if grown is not None and 0 < n_wanted == late + dropped["duplicate"]:
-        before = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.earliest_ms - 1}"
+        before = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.mapping.earliest_ms - 1}"
         # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
         if log.one(f"SELECT count(*) FROM {ROWS} WHERE {before}")[0] >= late:
             raise NoRowsError(
                 f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
-                f"of {_clock(log.earliest_ms - 1)} UTC; give newer logs"
+                f"of {_clock(log.mapping.earliest_ms - 1)} UTC; give newer logs"
             )
     reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
     hint = f"; {_CLOCK_HINT}" if late else ""
@@ -421,18 +410,6 @@ def _propose_times(log: TypedLog, mapping: LogMapping) -> str:
                 log.one(f"SELECT max({sums.sql}::VARCHAR) FROM {table.of(sums.columns).sql}")
             return f": --column timestamp='{expression}'"
     return ""
-
-
-def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:
-    """Warn of times of a split that leave a part of the log without rows."""
-    if names := [name for name, split in report["splits"].items() if not split["steps"]]:
-        begin, end = map(_clock, report["time_range_ms"])
-        _note(
-            rows,
-            f"--split {','.join(map(_clock, report['split_times_ms']))} leaves no rows for "
-            f"{' and '.join(names)}: the rows are from {begin} to {end} UTC; give times between "
-            "these, or three shares",
-        )
 
 
 def _note(rows: SortedRows, message: str) -> None:

@@ -6,12 +6,14 @@ columns in any order, and text that looks like a number stays available as text 
 
 import contextlib
 import csv
+import glob
 import gzip
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, TextIO, cast
+from typing import Final, TextIO, cast
 
 import duckdb
 import pyarrow as pa
@@ -21,7 +23,6 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
 
-_MAGIC = re.compile(r"[\[*?]")
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
 _NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
@@ -36,6 +37,8 @@ _MAX_FAULT = 300
 """Most characters of a message of DuckDB, which may quote values of any length."""
 _MOST_NESTED: Final = 32
 """Most levels of a Parquet column; a list is two, and DuckDB's time doubles with each list."""
+_NESTED_TOO_DEEP: Final = "schema too deeply nested"
+"""Arrow's words."""
 NOTHING: Final = '"NULL"'
 """DuckDB type of a column without any value."""
 ISO_TIME: Final = (
@@ -171,7 +174,7 @@ def _wider_type(kind: str) -> str:
 def glob_pattern(file: Path) -> str:
     """Glob pattern that matches only `file`: DuckDB treats every path as a pattern."""
     # Of "~" at the begin, it would make the folder of the user.
-    return re.sub("^~", "./~", _MAGIC.sub(r"[\g<0>]", str(file)))
+    return re.sub("^~", "./~", glob.escape(str(file)))
 
 
 def quote(value: str) -> str:
@@ -222,19 +225,19 @@ def open_tables(
     as `date=2026-08-01` give columns. Raises InputError if a file is truncated or not of the kind
     that its suffix says, no file has a row, or a column has another value than the folder says.
     """
-    tables: list[Table] = []
+    singles = []
     for file in files:
-        columns = _columns(connection, file)
-        if columns is None:
-            continue
-        opened = Table((file,), columns)
-        if partitions:
-            opened = replace(opened, partitions=_partitions(connection, opened))
-        same = replace(tables[-1], files=opened.files) if tables else None
-        if same == opened and tables[-1].files[0].suffix == file.suffix:
-            tables[-1] = replace(opened, files=(*tables[-1].files, file))
-        else:
-            tables.append(opened)
+        if columns := _columns(connection, file):
+            single = Table((file,), columns)
+            folders = _partitions(connection, single) if partitions else ()
+            singles.append(replace(single, partitions=folders))
+    tables = [
+        replace(first, files=(*first.files, *(table.files[0] for table in more)))
+        for first, *more in (
+            [*group]
+            for _, group in groupby(singles, lambda t: (t.types, t.partitions, t.files[0].suffix))
+        )
+    ]
     if not tables:
         raise InputError(
             f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"
@@ -287,7 +290,7 @@ def _columns(
         if not is_parquet:
             return None
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
-    if "\\" in str(file) and _MAGIC.search(str(file)):
+    if "\\" in str(file) and glob.has_magic(str(file)):
         raise InputError(
             f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
         )
@@ -296,12 +299,19 @@ def _columns(
     source = Table((file,), ()).source
     try:
         if is_parquet:
-            _require_plausible(file)
+            metadata = pq.read_metadata(file)
+            require_plausible_rows(file, metadata.num_rows)
+            paths = (metadata.schema.column(n).path for n in range(metadata.num_columns))
+            if any(path.count(".") > _MOST_NESTED for path in paths):
+                raise OSError(_NESTED_TOO_DEEP)
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
     except (duckdb.Error, pa.ArrowException, OSError) as error:
-        if "too deeply nested" in str(error):
-            raise _nested_too_deep(file, "a column") from None
+        if _NESTED_TOO_DEEP in str(error):
+            raise InputError(
+                f"{file}: a column has lists in lists, more than {_MOST_NESTED // 2} levels deep; "
+                "flatten or remove it"
+            ) from None
         if "not utf-8 encoded" in str(error):
             raise InputError(
                 f"{file} is not in UTF-8; convert it, e.g. with iconv -t UTF-8"
@@ -321,23 +331,6 @@ def _columns(
     for name in set(second).difference(_written_names(file) if second else ()):
         raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
     return columns if is_parquet else _types_of_all_rows(connection, file, columns)
-
-
-def _require_plausible(file: Path) -> None:
-    """Refuse a Parquet file of very many equal rows, or with values that are nested so deep that
-    DuckDB would not end."""
-    metadata = pq.read_metadata(file)
-    require_plausible_rows(file, metadata.num_rows)
-    for path in (metadata.schema.column(n).path for n in range(metadata.num_columns)):
-        if path.count(".") > _MOST_NESTED:
-            raise _nested_too_deep(file, f"column {path.partition('.')[0]}")
-
-
-def _nested_too_deep(file: Path, column: str) -> InputError:
-    return InputError(
-        f"{file}: {column} has lists in lists, more than {_MOST_NESTED // 2} levels deep; flatten "
-        "or remove it"
-    )
 
 
 def _require_header(file: Path, columns: Sequence[str]) -> None:
@@ -389,17 +382,11 @@ def _types_of_all_rows(
     order. A column without any value has the type `NOTHING`.
     """
     kinds = dict(types)
-    # A column without a value is text; most columns of text have one in the first rows.
-    words = [name for name, kind in types if kind == "VARCHAR"]
-    counts = _first_row(
-        connection, Table((file,), types), [f"count({quote_name(n)})" for n in words], 1000
-    )
-    words = [name for name, count in zip(words, counts, strict=False) if not count]
-    changes: list[tuple[str, str, str]] = [
-        (name, NOTHING, f"count({quote_name(name)}) = 0") for name in words
-    ]
+    changes: list[tuple[str, str, str]] = []
     for name, kind in types:
         column = quote_name(name)
+        if kind == "VARCHAR":
+            changes.append((name, NOTHING, f"count({column}) = 0"))
         if kind in _EXACT:
             differs = f"TRY_CAST({column} AS {_EXACT[kind]}) <> TRY_CAST({column} AS {kind})"
             changes.append((name, _EXACT[kind], f"bool_or({differs})"))
@@ -409,32 +396,16 @@ def _types_of_all_rows(
         if kind == "BIGINT":
             changes.append((name, "VARCHAR", f"bool_or(regexp_full_match({column}, '-?0\\d+'))"))
     as_text = {name: "VARCHAR" for name, _, _ in changes}
-    source = Table((file,), tuple((kinds | as_text).items()))
-    holding = _first_row(connection, source, [condition for *_, condition in changes])
-    for (name, kind, _), holds in zip(changes, holding, strict=False):
-        kinds[name] = kind if holds else kinds[name]
+    source = Table((file,), tuple((kinds | as_text).items())).source
+    values = ", ".join(condition for *_, condition in changes) or "1"
+    # Where the file cannot be read, reading its rows says why.
+    with contextlib.suppress(duckdb.Error):
+        query = f"SELECT {values} FROM {source[:-1]}, ignore_errors = true)"
+        (holding,) = connection.sql(query).fetchall()
+        kinds |= {
+            name: kind for (name, kind, _), holds in zip(changes, holding, strict=False) if holds
+        }
     return tuple(kinds.items())
-
-
-def _first_row(
-    connection: duckdb.DuckDBPyConnection,
-    table: Table,
-    values: Sequence[str],
-    rows: int | None = None,
-) -> tuple[Any, ...]:
-    """Aggregates of a CSV file, or of its first rows; none where it cannot be read, which reading
-    the rows shows."""
-    if not values:
-        return ()
-    source = f"{table.source[:-1]}, ignore_errors = true)"
-    limit = f" LIMIT {rows}" if rows else ""
-    try:
-        (row,) = connection.sql(
-            f"SELECT {', '.join(values)} FROM (FROM {source}{limit})"
-        ).fetchall()
-    except duckdb.Error:
-        return ()
-    return tuple(row)
 
 
 def first_line(error: Exception) -> str:

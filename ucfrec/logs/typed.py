@@ -2,11 +2,11 @@
 
 import re
 from calendar import month_name
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import duckdb
 
@@ -21,7 +21,6 @@ from ucfrec.logs.engine import (
     text_of_column,
     wrong_type,
 )
-from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 from ucfrec.logs.tables import (
     ISO_TIME,
@@ -44,7 +43,7 @@ ROWS: Final = "read"
 """Relation of `TypedLog`."""
 WANTED: Final = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
-_VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
+VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
 _BATCH_BYTES: Final = 2**25
 _IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
 """SQL of whether a text `x` is as the integer that it means is written."""
@@ -88,39 +87,25 @@ def open_log_tables(
 
 
 @dataclass(frozen=True)
-class TypedColumns:
-    """SQL of the typed columns of a log."""
-
-    names: tuple[str, ...]
-    """Log columns that the files have, `user_id` first."""
-    selects: tuple[str, ...]
-    """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
-    tables: tuple[Table, ...]
-    """The tables with no other columns than these values need."""
-    session_by: str
-    """"session_id", "gap" or "user"."""
-
-
-@dataclass(frozen=True)
 class TypedLog:
-    """A log whose rows, unchecked, are the relation `read` of `connection`.
+    """A log with SQL of its typed columns; `open_log` creates the relation `read` of its rows.
 
     `read` has the log columns of `columns` in the types of the schema, `reward` (DOUBLE) and `row`
-    (position in the files, from 1).
+    (position in the files, from 1); no row has been checked.
     """
 
     connection: duckdb.DuckDBPyConnection
     tables: tuple[Table, ...]
+    """The tables with no other columns than the values need."""
+    selects: tuple[str, ...]
+    """For each table, the values of `columns`, `reward` and perhaps `WANTED`, as after SELECT."""
     columns: tuple[str, ...]
     """Log columns that the files have, `user_id` first."""
-    vector_size: dict[str, int]
-    """Dimensions of `action` and `observation`, if the log has them."""
     session_by: str
     """"session_id", "gap" or "user"."""
-    earliest_ms: int
-    """Rows with an earlier time (ms) are dropped as clock errors."""
-    has_condition: bool
-    """Whether its rows have the column `WANTED`."""
+    mapping: LogMapping
+    vector_size: Mapping[str, int] = field(default_factory=dict)
+    """Dimensions of `action` and `observation`, if the log has them; see `measure_vectors`."""
 
     @property
     def key(self) -> str:
@@ -153,7 +138,7 @@ class TypedLog:
             raise InputError(f"{self.name}: its actions are vectors; map item_id instead")
 
 
-def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
+def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
     """Resolve the columns and the reward of a log; `as_text` are ids that are text even if all of
     them are integers.
 
@@ -170,106 +155,90 @@ def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
     key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
     optional = (name for name in OPTIONAL_COLUMNS if name in present)
     columns = (schema.USER_ID, key, schema.TIMESTAMP, *optional)
-    _note_partial(log.tables, {*columns, *log.mapping.columns})
+    every = [file for table in log.tables for file in table.files]
+    for name in (n for n in OPTIONAL_COLUMNS if n not in {*columns, *log.mapping.columns}):
+        having = (table for table, folded in zip(log.tables, names, strict=True) if name in folded)
+        if files := [file for table in having for file in table.files]:
+            warn_user(
+                f"{name} is excluded: only {len(files)} of {len(every)} files have it ({files[0]});"
+                f" add it to the others, or drop it with --column {name}="
+            )
     selects = [_select(log, table, columns) for table in log.tables]
     for name in _IDS:
         if name in columns:
             _unify_ids(log.connection, selects, name, name in as_text)
-    return TypedColumns(
-        columns,
-        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+    return TypedLog(
+        log.connection,
         tuple(table for table, _ in selects),
+        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+        columns,
         log.session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
+        log.mapping,
     )
 
 
-def number_rows(selects: Iterable[tuple[str, str]]) -> str:
-    """SQL of typed rows with `row`, their position from 1; for each table, values as of
-    `TypedColumns.selects` and the SQL of the table."""
-    union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in selects)
+def number_rows(selects: Iterable[tuple[str, Table]]) -> str:
+    """SQL of typed rows with `row`, their position from 1, of values as of `TypedLog.selects`."""
+    union = " UNION ALL ".join(f"SELECT {values} FROM {table.sql}" for values, table in selects)
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
 def open_log(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
-    """Create `read` from the tables of a log; see `type_columns` and `describe_log`."""
+    """Create `read` from the tables of a log; see `type_columns` and `measure_vectors`."""
     typed = type_columns(log, as_text)
     with explain_errors(log.connection, log.tables):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
-        columnar = all(table.columnar for table in log.tables)
-        rows = number_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
-        log.connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
-        has_vectors = {*_VECTORS} & {*typed.names}
-        query = survey_vectors(typed.names, ROWS)
-        survey = log.connection.sql(query).fetchall() if has_vectors else []
-    return describe_log(log, typed, survey)
+        kind = "VIEW" if all(table.columnar for table in log.tables) else "TABLE"
+        rows = number_rows(zip(typed.selects, typed.tables, strict=True))
+        log.connection.execute(f"CREATE {kind} {ROWS} AS {rows}")
+        query = survey_vectors(typed.columns, ROWS)
+        has_vectors = {*VECTORS} & {*typed.columns}
+        return measure_vectors(typed, log.connection.sql(query).fetchall() if has_vectors else [])
 
 
 def survey_vectors(columns: Collection[str], rows: str) -> str:
-    """SQL of the sizes of `action` and `observation` in rows of a log with some columns, the number
-    `n` of rows with these, and how many of them have no finite observation."""
-    sizes = (f"CAST({f'len({v})' if v in columns else 'NULL'} AS BIGINT) AS {v}" for v in _VECTORS)
+    """SQL of the least and the largest size of `action` and of `observation` in rows of a log with
+    some columns, the number `n` of rows, and how many of them have no finite observation."""
+    sizes = (
+        f"CAST({end}({f'len({name})' if name in columns else 'NULL'}) AS BIGINT) AS {end}_{name}"
+        for name in VECTORS
+        for end in ("min", "max")
+    )
     bad = f"count_if({not_finite(schema.OBSERVATION)})" if schema.OBSERVATION in columns else "0"
-    aggregates = f"count(*) AS n, CAST({bad} AS BIGINT) AS bad"
-    return f"SELECT {', '.join(sizes)}, {aggregates} FROM {rows} GROUP BY ALL"
+    return f"SELECT {', '.join(sizes)}, count(*) AS n, CAST({bad} AS BIGINT) AS bad FROM {rows}"
 
 
-def describe_log(
-    log: LogTables, typed: TypedColumns, survey: Sequence[tuple[int | None, ...]]
-) -> TypedLog:
-    """The log of typed columns, whose rows its connection has; `survey` as of `survey_vectors`,
-    empty without vectors.
+def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLog:
+    """The log with the sizes of its vectors, by the rows of `survey_vectors`.
 
-    Raises InputError if a column has vectors of unequal or no size, or an observation is not
-    finite.
+    Raises InputError if sizes are unequal or 0, or an observation is not finite.
     """
     sizes: dict[str, int] = {}
-    for name in (name for name in _VECTORS if name in typed.names):
-        counts: Counter[int] = Counter()
-        for *row_sizes, n, _ in survey:
-            if (size := row_sizes[_VECTORS.index(name)]) is not None:
-                counts[size] += n or 0
-        ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
-        if len(ordered) > 1:
-            lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
-            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
-        if not ordered or ordered[0][0] == 0:
-            raise InputError(
-                f"{name} is empty in every row; map another column or --column {name}="
-            )
-        sizes[name] = ordered[0][0]
-    if bad := sum(row[-1] or 0 for row in survey):
+    for place, name in enumerate(VECTORS):
+        if name in log.columns:
+            ends = [n for row in survey for n in row[2 * place : 2 * place + 2] if n is not None]
+            least, sizes[name] = min(ends, default=0), max(ends, default=0)
+            if least < sizes[name]:
+                raise InputError(
+                    f"{name} has lists of unequal length, {least} to {sizes[name]}; make them equal"
+                )
+            if not least:
+                raise InputError(
+                    f"{name} is empty in every row; map another column or --column {name}="
+                )
+    if bad := sum(row[-1] for row in survey):
         raise InputError(
             f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
-            f"in {bad:,} of {sum(row[-2] or 0 for row in survey):,} rows; fill them in, leave "
-            f"those rows out, or ignore the column with --column {schema.OBSERVATION}="
+            f"in {bad:,} of {sum(row[-2] for row in survey):,} rows; fill them in, leave those "
+            f"rows out, or ignore the column with --column {schema.OBSERVATION}="
         )
-    return TypedLog(
-        log.connection,
-        typed.tables,
-        typed.names,
-        sizes,
-        typed.session_by,
-        log.mapping.earliest_ms,
-        log.mapping.where is not None,
-    )
+    return replace(log, vector_size=sizes)
 
 
 def not_finite(vector: str) -> str:
     """SQL that says whether a vector is missing or has a number that is not finite."""
     finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
     return f"{vector} IS NULL OR NOT {finite}"
-
-
-def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
-    """Warn of optional columns, but those excluded, that only some files have."""
-    count = sum(len(table.files) for table in tables)
-    for name in (name for name in OPTIONAL_COLUMNS if name not in excluded):
-        having = (t for t in tables if name in map(str.casefold, t.columns))
-        if files := [file for table in having for file in table.files]:
-            warn_user(
-                f"{name} is excluded: only {len(files)} of {count} files have it ({files[0]}); add "
-                f"it to the others, or drop it with --column {name}="
-            )
 
 
 _Values = dict[str, tuple[str, str]]
@@ -323,18 +292,13 @@ def _bind_reward(
     try:
         return table, bind(connection, table, "for the reward", reward)
     except InputError:
-        try:
-            names = {name.casefold() for name in columns_of(connection, reward)}
-        except NotScalarError:
-            names = set()
-        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in names]
+        words = re.findall(r"\w+", reward.casefold())
+        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in words]
         if not texts:
             raise
         counts = ", ".join(f"count({quote_name(name)})" for name in texts)
         (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
         empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
-        if not empty:
-            raise
         table = replace(table, types=tuple((dict(table.types) | empty).items()))
         return table, bind(connection, table, "for the reward", reward)
 
@@ -352,8 +316,21 @@ def _cast_value(
     nothing = "false" if name == schema.IS_RANDOM else f"CAST(NULL AS {_TYPES[name]})"
     if kind == NOTHING:
         return nothing, NOTHING
-    if name in _IDS or name == schema.TIMESTAMP:
-        _require_exact(connection, table, name, expression, bound.columns)
+    # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
+    inexact = {schema.TIMESTAMP: ("FLOAT",), **dict.fromkeys(_IDS, WHOLE)}.get(name, ())
+    for column in (column for column in bound.columns if table.columns[column] in inexact):
+        real = table.columns[column]
+        with explain_errors(connection, (table,)):
+            ((rounded, count),) = connection.sql(
+                f"SELECT count_if(abs(x) >= {WHOLE[real]}), count(x) FROM "
+                f"(SELECT {quote_name(column)} AS x FROM {table.of([column]).sql})"
+            ).fetchall()
+        if rounded:
+            raise InputError(
+                f"{table.files[0]}: {name} ({expression}) reads {column}, which is {real}, and "
+                f"{rounded:,} of {count:,} values are {WHOLE[real]:,} or more and rounded; write "
+                "them as int64 where the log is made, as a cast here cannot restore them"
+            )
     if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
@@ -390,33 +367,6 @@ def _cast_value(
     raise wrong_type(table, name, expression, kind, remedy)
 
 
-def _require_exact(
-    connection: duckdb.DuckDBPyConnection,
-    table: Table,
-    name: str,
-    expression: str,
-    columns: Sequence[str],
-) -> None:
-    """Refuse an id or a time of columns of reals that do not hold every whole number there is."""
-    for column in columns:
-        kind = table.columns[column]
-        # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
-        if kind not in WHOLE or (name == schema.TIMESTAMP and kind == "DOUBLE"):
-            continue
-        with explain_errors(connection, (table,)):
-            ((rounded, count),) = connection.sql(
-                f"SELECT count_if(abs(x) >= {WHOLE[kind]}), count(x) FROM "
-                f"(SELECT {quote_name(column)} AS x FROM {table.of([column]).sql})"
-            ).fetchall()
-        if rounded:
-            raise InputError(
-                f"{table.files[0]}: {name} ({expression}) reads {column}, which is {kind} "
-                f"(float{32 if kind == 'FLOAT' else 64}): {rounded:,} of {count:,} values are "
-                f"{WHOLE[kind]:,} or more and rounded; write them as int64 where the log is made, "
-                "as a cast here cannot restore them"
-            )
-
-
 def _unify_ids(
     connection: duckdb.DuckDBPyConnection,
     selects: list[tuple[Table, _Values]],
@@ -425,7 +375,7 @@ def _unify_ids(
 ) -> None:
     """Cast ids to BIGINT if every file has integers that fit and, in a CSV file, are written as
     integers are (not 007, 7.0 or 1e1), else or with `as_text` to text."""
-    whole, some_whole, with_decimals = True, False, None
+    whole, some_whole, with_decimals = not as_text, False, None
     for table, values in selects:
         sql, kind = values[name]
         # The type that DuckDB inferred for a column of a CSV file, whose text is read.
@@ -444,7 +394,6 @@ def _unify_ids(
         if (csv_type or kind) == "DOUBLE":
             with_decimals = with_decimals or table
         whole &= kind == NOTHING or all_integers
-    whole &= not as_text
     if not whole and some_whole and with_decimals is not None:
         warn_user(
             f"{name} is written as whole numbers and, in {with_decimals.files[0]}, with decimals: "
@@ -457,19 +406,9 @@ def _unify_ids(
         values[name] = (typed, "")
 
 
-class _Survey(NamedTuple):
-    """Of the text in a column of one file: how many are what, and the largest parts of dates."""
-
-    filled: int
-    numbers: int
-    iso: int
-    dated: int
-    """Times that begin with the day or the month; the next three are of these."""
-    first: int | None
-    second: int | None
-    example: str | None
-    strange: str | None
-    """Text that is none of these."""
+_Survey = namedtuple("_Survey", "filled numbers iso dated first second example strange")
+"""Of the text in a column of one file: how many are what, and of those that begin with the day or
+the month (`dated`) the largest numbers and one; and one that is none of these."""
 
 
 def cast_text_time(
@@ -505,8 +444,7 @@ def cast_text_time(
                 f"{where} has the day first in some files and the month in others; prepare "
                 "them apart, each with its --time-format"
             )
-        (order,) = orders
-        start = quote("^" + _DAY_OR_MONTH_FIRST + "$")
+        order, start = min(orders), quote("^" + _DAY_OR_MONTH_FIRST + "$")
         plain = rf"trim(regexp_replace(trim({sql}), {start}, '\1/\2/\3 \4'))"
         # A comma or T before the time of day.
         plain = rf"regexp_replace({plain}, '\s+[T,]?\s*', ' ')"
@@ -518,14 +456,11 @@ def cast_text_time(
             f"{where} is {strange!r:.60}, no ISO 8601 time nor milliseconds; say how it is "
             "written with --time-format, e.g. '%d %b %Y %H:%M'"
         )
-    number = f"TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT)"
     plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
     # DuckDB reads no zone after a blank.
     plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
     time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
-    if not iso:
-        return number
-    return f"coalesce({time}, {number})" if numbers else time
+    return f"coalesce(TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT), {time})"
 
 
 def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _Survey:
@@ -533,25 +468,24 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
     dated = f"regexp_full_match(x, {quote(_DAY_OR_MONTH_FIRST)})"
     number = "TRY_CAST(x AS DOUBLE) IS NOT NULL"
     first, second = (
-        f"TRY_CAST(regexp_extract(x, {quote('^' + _DAY_OR_MONTH_FIRST + '$')}, {n}) AS INTEGER)"
+        f"max(TRY_CAST(regexp_extract(x, {quote(f'^{_DAY_OR_MONTH_FIRST}$')}, {n}) AS INTEGER))"
         for n in (1, 2)
     )
     (row,) = connection.sql(
         f"SELECT count(x), count_if({number}), count_if({iso}), count_if({dated}), "
-        f"max({first}), max({second}), min(CASE WHEN {dated} THEN x END), "
+        f"coalesce({first}, 0), coalesce({second}, 0), min(CASE WHEN {dated} THEN x END), "
         f"min(CASE WHEN NOT ({number} OR {iso} OR {dated}) THEN x END) "
         f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"
     ).fetchall()
-    return _Survey._make(row)
+    return _Survey(*row)
 
 
 def _order(file: Path, survey: _Survey) -> str:
     """How day and month follow each other in a file: "%d/%m" or "%m/%d"."""
-    days = (survey.first or 0) > 12, (survey.second or 0) > 12
-    if days[0] != days[1]:
-        return "%d/%m" if days[0] else "%m/%d"
-    where, example = f"{file}: timestamp is {survey.example!r:.40}", str(survey.example)
-    if all(days):
+    if (survey.first > 12) != (survey.second > 12):
+        return "%d/%m" if survey.first > 12 else "%m/%d"
+    where, example = f"{file}: timestamp is {survey.example!r:.40}", survey.example
+    if survey.first > 12:
         raise InputError(
             f"{where}, and neither day/month nor month/day reads every row; say how times are "
             "written with --time-format"

@@ -231,7 +231,7 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
     """Sum of the values, numbers of values and rows of each user in each arm; "" for no arm."""
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
-        engine(files, folder, memory_limit, shared=True) as connection,
+        engine(files, folder, memory_limit) as connection,
     ):
         tables = tuple(open_tables(connection, files))
         for table in tables:

@@ -55,8 +55,9 @@ _TYPES: Final = ("constrained-str", "float", "constrained-int")
 """Last part of pydantic's place of an error in one of several types."""
 _ROWS: Final = "history"
 """Name of the rows in messages and in the engine."""
-_MEMORY: Final = "256MB"
-"""Of the engine: a request is some megabytes, and no expression makes much more of it."""
+_MEMORY: Final = "512MB"
+"""Of which the engine may take half: a request is some megabytes, and no expression makes much more
+of it."""
 
 
 def _parse_time(value: float | str) -> float:

@@ -59,12 +59,9 @@ class VectorHead(nn.Module):
         """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Mean squared error over M steps in units of `scale`: features (M, d), actions (M, A)."""
-        return F.mse_loss(self.predict(features) / self.scale, actions / self.scale)
-
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """The squared error of each of M steps, (M,), whose mean is `loss`."""
+        """The mean squared error (M,) of each of M steps in units of `scale`, from features (M, d)
+        and actions (M, A)."""
         error = (self.predict(features) - actions) / self.scale
         return error.square().mean(-1)
 
@@ -107,8 +104,9 @@ class ItemHead(nn.Module):
         self._proposal: Proposal | None = None
 
     def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
-        """Set the embeddings (n_items, D) and, from training counts (n_items,), the bias."""
-        self.embeddings.copy_(embeddings)
+        """Set the embeddings (n_items, D), which are not copied, and, from training counts
+        (n_items,), the bias."""
+        self.embeddings = embeddings.to(self.embeddings)
         self.counts.copy_(counts + 1)
         self._proposal = None
         with torch.no_grad():
@@ -160,14 +158,9 @@ class ItemHead(nn.Module):
         """The columns (M, L) of `predict` of `items` (L,), ascending, each once."""
         return self._logits(features, self.embed(items), self._gather_bias(items), items, exposed)
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
-        if self.samples:
-            return self.losses(features, actions, exposed).mean()
-        return F.cross_entropy(self.predict(features, exposed), actions)
-
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """The negative log-likelihood (nats) of each of M steps, (M,), whose mean is `loss`."""
+        """The negative log-likelihood (nats) of each of M steps, (M,): features (M, d), actions
+        (M,)."""
         if not self.samples:
             return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
         logit = self.logit(features, actions, exposed)

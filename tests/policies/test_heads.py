@@ -151,7 +151,7 @@ def test_exposure_is_added_to_the_logits(tags: bool) -> None:
     expected = -logits.log_softmax(-1)[torch.arange(9), actions]
     torch.testing.assert_close(losses, expected)
     some = torch.tensor([0, 3, 4, 31, N - 1])
-    torch.testing.assert_close(head.predict_items(features, some, shown), logits[:, some])
+    torch.testing.assert_close(head.predict(features, shown, some), logits[:, some])
 
 
 def test_vectors_are_kept_until_a_weight_changes() -> None:

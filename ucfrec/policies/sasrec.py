@@ -99,7 +99,7 @@ class GSASRecPolicy(SASRecPolicy):
         beta = rate * (t * (1 - 1 / rate) + 1 / rate)
         # Where the bias is the log share of an item, the scores are the loss's best ones.
         offset = math.log(beta / rate)
-        negative = head.predict_items(features, items, exposed) + offset
+        negative = head.predict(features, exposed, items) + offset
         positive = head.logit(features, actions, exposed) + offset
         is_negative = items != actions.unsqueeze(1)
         against = (F.softplus(negative) * is_negative).sum(1)

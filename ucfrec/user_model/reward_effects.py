@@ -26,7 +26,7 @@ EFFECTS: Final = (
 _ITERATIONS: Final = 100
 _HISTORY: Final = 10
 """Steps that L-BFGS remembers, …"""
-_REMEMBERED: Final = 2**25
+_REMEMBERED: Final = 3 * 2**23
 """… in at most so many numbers, or 2 steps; twice, for the changes of the gradient."""
 _TOLERANCE: Final = 1e-6
 """Relative decrease of the objective in an iteration at which a fit ends."""

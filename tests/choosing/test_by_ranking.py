@@ -3,22 +3,25 @@
 import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from tests.support.logs import store_of
 from tests.support.tagged import tagged_log, tagged_mapping, tagged_store
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import logged_scores
+from ucfrec.acting.scorer import Query, Scorer, logged_scores
+from ucfrec.choosing import by_ranking
 from ucfrec.choosing.by_ranking import (
     SHOWN,
     LoggedEvidence,
     _choose_best,
     choose_by_ranking,
 )
-from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
+from ucfrec.choosing.by_simulation import RuleSearch, _batch_rules, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
@@ -91,6 +94,25 @@ def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(fold
     too_large = min(weight for weight, enough in overlaps.items() if not enough)
     largest = max(weight for weight, enough in overlaps.items() if enough)
     assert too_large - largest == 1000 / 2 ** (len(overlaps) - 2)
+
+
+def test_scores_in_memory_do_not_grow_with_the_catalogue(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, score = set[int](), Scorer.scores_of
+
+    def score_and_count(scorer: Scorer, query: Query, **options: Any) -> Tensor:
+        rows.add(len(query.items))
+        return score(scorer, query, **options)
+
+    monkeypatch.setattr(Scorer, "scores_of", score_and_count)
+    expected = chosen(folder, 50.0, 0.0, 1.0).list_candidates()
+    monkeypatch.setattr(by_ranking, "_SCORES_AT_ONCE", 24 * 3)
+    rows.clear()
+    assert chosen(folder, 50.0, 0.0, 1.0).list_candidates() == expected
+    assert max(rows) == 3
+    parts = [[(0, slice(0, 2))], [(0, slice(2, 3))], [(2, slice(3, 5))]]
+    assert _batch_rules(np.array([0, 0, 0, 2, 2]), 2) == parts
 
 
 def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -> None:

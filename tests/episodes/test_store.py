@@ -5,7 +5,6 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import matplotlib as mpl
 import numpy as np
@@ -35,7 +34,6 @@ from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes import store as store_module
-from ucfrec.episodes import view as view_module
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.writer import StoreWriter
@@ -301,9 +299,7 @@ def test_the_rows_before_a_step_are_those_of_the_user(
     view = rows.continue_sessions(gap)
 
     assert view.n_steps == later.n_steps
-    for long_enough in (1, 1000):
-        with patch.object(view_module, "_LONG_ENOUGH", long_enough):
-            assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
+    assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
     episodes, steps = view.all_steps()
     recent = rows.recent(np.arange(view.n_steps), 4)
     owner, seen = rows.seen(np.arange(view.n_steps))

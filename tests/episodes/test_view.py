@@ -220,12 +220,8 @@ def test_a_column_that_cannot_be_is_named(
         use(EpisodeStore.open(store.path))
 
 
-@pytest.mark.parametrize("long_enough", [1, 1000])
-def test_steps_in_batches_are_all_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, long_enough: int
-) -> None:
+def test_steps_in_batches_are_all_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view_module, "_BATCH_STEPS", 7)
-    monkeypatch.setattr(view_module, "_LONG_ENOUGH", long_enough)
     store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
     for view in (store, store.select(np.array([2, 0, 2])), store.select(np.array([1, 2, 0]))):
         episodes, steps = zip(*view.step_batches(), strict=True)

@@ -25,7 +25,6 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import new_policy
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.session_end import BoostedTrees, fit_trees
 
 ITEMS, DAYS = 20, 10
 
@@ -128,22 +127,6 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[BoostedPolicy, Epi
     policy = new_policy(store, resolve_config("boosted", None, settings)).eval()
     policy.make_solver(store, None, Path(), 0)()
     return policy, store
-
-
-def test_tables_are_the_trees_of_scikit_learn(
-    fitted: tuple[BoostedPolicy, EpisodeStore], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy, store = fitted
-    numbers = np.arange(store.n_steps)
-    inputs, liked = policy._rows(store, numbers)
-    trees = BoostedTrees(**fit_trees(inputs, liked, 0))
-    at = store.locate(numbers[:200])
-    windows = store.windows(*at, 6)
-    monkeypatch.setattr(policy, "_inputs", lambda *_: torch.from_numpy(inputs[:200, None]))
-    found = policy._score(windows, windows.actions[:, -1:])[:, 0]
-    torch.testing.assert_close(
-        found.double(), trees(torch.from_numpy(inputs[:200])), atol=1e-4, rtol=1e-4
-    )
 
 
 def test_only_the_best_items_are_boosted(fitted: tuple[BoostedPolicy, EpisodeStore]) -> None:

@@ -57,11 +57,11 @@ def test_the_reward_estimator_learns_the_reward_of_the_action_taken(sizes: dict[
     first = policy.loss(windows)[1]["reward_loss"]
     trained(policy, windows, 150)
     assert policy.loss(windows)[1]["reward_loss"] < 0.1 * first
-    hidden = policy.transform(policy.normalize(windows))
-    estimate = policy.estimate_rewards(hidden, windows.mask)
     later = changed_at(windows, (slice(None), 6), ("actions",))
-    hidden = policy.transform(policy.normalize(later))
-    moved = policy.estimate_rewards(hidden, windows.mask)
+    estimate, moved = (
+        policy.estimate_rewards(policy.attend(policy.tokens(w), w.mask), w.mask)
+        for w in map(policy.normalize, (windows, later))
+    )
     torch.testing.assert_close(moved[:, :6], estimate[:, :6])
     assert not torch.allclose(moved[:, 6], estimate[:, 6])
 

@@ -46,7 +46,8 @@ def test_vectors_stay_in_range_and_their_error_is_in_shares_of_it(
     predicted = head.predict(features).detach()
     assert (predicted.abs() <= head.scale).all()
     expected = np.mean(((predicted - actions) / head.scale).numpy() ** 2)
-    assert float(head.loss(features, actions).detach()) == pytest.approx(expected, rel=1e-4)
+    found = head.losses(features, actions).mean().detach()
+    assert float(found) == pytest.approx(expected, rel=1e-4)
 
 
 def test_an_untrained_policy_recommends_what_is_popular() -> None:
@@ -62,19 +63,19 @@ def test_an_untrained_policy_recommends_what_is_popular() -> None:
 def test_its_gradient_approaches_the_full_one() -> None:
     head = item_head()
     features, actions = steps(head, 200)
-    full = gradients_of(head, lambda: head.loss(features, actions))
+    full = gradients_of(head, lambda: head.losses(features, actions))
     differences = []
     for samples in (20, 100, 1000):
         head.samples = samples
-        sampled = gradients_of(head, lambda: sum(head.loss(features, actions) for _ in range(40)))
-        differences.append(float((sampled / 40 - full).norm() / full.norm()))
+        drawn = gradients_of(head, lambda: sum(head.losses(features, actions) for _ in range(40)))
+        differences.append(float((drawn / 40 - full).norm() / full.norm()))
     assert differences[0] > differences[1] > differences[2] < 0.01
 
 
 def gradients_of(module: nn.Module, loss: Callable[[], Tensor]) -> Tensor:
     """The gradient of `loss` by all parameters of the module."""
     module.zero_grad()
-    loss().backward()  # type: ignore[no-untyped-call]
+    loss().mean().backward()  # type: ignore[no-untyped-call]
     found = [parameter.grad for parameter in module.parameters()]
     return torch.cat([each.to_dense().flatten() for each in found if each is not None])
 
@@ -106,7 +107,7 @@ def test_gradients_have_the_rows_that_took_part_only() -> None:
     head = ItemHead(DIM, 50_000, 5, samples=64)
     head.start_from(torch.randn(50_000, 5), torch.rand(50_000))
     features, actions = torch.randn(32, DIM), torch.randint(50_000, (32,))
-    head.loss(features, actions).backward()  # type: ignore[no-untyped-call]
+    head.losses(features, actions).mean().backward()  # type: ignore[no-untyped-call]
     for table in (head.correction, head.bias):
         assert table.grad.is_sparse
         rows = table.grad.coalesce().indices()[0]
@@ -149,9 +150,8 @@ def test_exposure_is_added_to_the_logits(tags: bool) -> None:
     losses = head.losses(features, actions, shown)
     expected = -logits.log_softmax(-1)[torch.arange(9), actions]
     torch.testing.assert_close(losses, expected)
-    torch.testing.assert_close(head.loss(features, actions, shown), losses.mean())
     some = torch.tensor([0, 3, 4, 31, N - 1])
-    torch.testing.assert_close(head.predict_items(features, some, shown), logits[:, some])
+    torch.testing.assert_close(head.predict(features, shown, some), logits[:, some])
 
 
 def test_vectors_are_kept_until_a_weight_changes() -> None:
@@ -169,7 +169,7 @@ def test_vectors_are_kept_until_a_weight_changes() -> None:
         return found
 
     before = check()
-    head.loss(features, torch.arange(4)).backward()  # type: ignore[no-untyped-call]
+    head.losses(features, torch.arange(4)).mean().backward()  # type: ignore[no-untyped-call]
     optimizer.step()
     assert not torch.allclose(check(), before)
     head.start_from(torch.randn(N, 5), torch.rand(N))

@@ -147,7 +147,7 @@ class DecisionRule:
         Args:
             scores: (B, n_items) of `Scorer.scores`.
         """
-        first, *second = (math.log(share) + logs for share, logs in self._modes(scores))
+        first, *second = (logs.add_(math.log(share)) for share, logs in self._modes(scores))
         return torch.logaddexp(first, second[0]) if second else first
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -158,7 +158,7 @@ class DecisionRule:
         """
         if not self.draws:
             return _best(scores), torch.ones(len(scores))
-        probabilities = self.log_probabilities(scores).exp()
+        probabilities = self.log_probabilities(scores).exp_()
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
@@ -214,7 +214,7 @@ class DecisionRule:
                 drawn_from = _only_best(scores, self.top_k)
                 # Relative to the best, so that no temperature makes every score −∞.
                 relative = drawn_from - drawn_from.amax(-1, keepdim=True)
-                logs = (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+                logs = relative.div_(max(self.temperature, _COLDEST)).log_softmax(-1)
             modes.append((1 - self.explore, logs))
         if self.explore > 0:
             allowed = _only_best(scores, self.explore_top)

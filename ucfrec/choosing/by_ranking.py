@@ -27,6 +27,8 @@ from ucfrec.user_model.reward_report import draw_steps, number_users, read_prope
 SHOWN = 10
 """Items that a rule shows at a step."""
 _AT_ONCE = 256
+_SCORES_AT_ONCE = 2**24
+"""Most scores of a batch, rows × items: 64 MiB."""
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
 """Validation rows that are ranked at most, in large and in small catalogues …"""
 _SCORES = 2e8
@@ -53,19 +55,20 @@ class LoggedScores:
         self._queries: dict[tuple[object, ...], Query] = {}
 
     @torch.no_grad()
-    def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
-        """Scores (B, n_items) by each rule of batches of the steps, and which steps they are."""
+    def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, int, Tensor]]:
+        """Of batches of the steps, scores (B, n_items) by each rule: steps, rule, scores."""
         scorers = [self._scorer.under(rule) for rule in rules]
         reach, widest = max((scorer.reach, number) for number, scorer in enumerate(scorers))
         weighted = any(rule.reward_weight for rule in rules)
         with progress(len(self.steps), "logged steps under each rule", "rows") as bar:
-            for first in range(0, len(self.steps), _AT_ONCE):
-                part = slice(first, min(first + _AT_ONCE, len(self.steps)))
+            n_items = len(self.view.item_states.embeddings)
+            at_once = max(1, min(_AT_ONCE, _SCORES_AT_ONCE // n_items))
+            for first in range(0, len(self.steps), at_once):
+                part = slice(first, min(first + at_once, len(self.steps)))
                 episodes, steps = self.episodes[part], self.steps[part]
                 queries = self._queries if self._scorer.has_factors else {}
                 sessions: Sessions | None = None
-                scores = list[Tensor]()
-                for rule, scorer in zip(rules, scorers, strict=True):
+                for number, (rule, scorer) in enumerate(zip(rules, scorers, strict=True)):
                     key = first, rule.target, rule.minimum_target, reach, weighted
                     if key not in queries:
                         sessions = sessions or sessions_before(
@@ -75,8 +78,7 @@ class LoggedScores:
                         # What has been read for the query is not needed again.
                         queries[key] = query._replace(sessions=replace(sessions, states=None))
                     seen = seen_before(self.view, episodes, steps) if rule.exclude_seen else None
-                    scores.append(scorer.scores_of(queries[key], excluded=seen))
-                yield part, scores
+                    yield part, number, scorer.scores_of(queries[key], excluded=seen)
                 bar.update(part.stop - part.start)
 
 
@@ -100,12 +102,11 @@ class LoggedEvidence:
         shape = len(rules), len(self._logged.steps)
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
         items = torch.from_numpy(self._logged.items).unsqueeze(1)
-        for part, scores in self._logged.score(rules):
-            for n, (rule, values) in enumerate(zip(rules, scores, strict=True)):
-                chances = rule.log_probabilities(values)
-                logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
-                top = best_items(values, min(SHOWN, values.shape[1]))
-                hits[n, part] = (top == items[part]).any(1).numpy()
+        for part, n, scores in self._logged.score(rules):
+            chances = rules[n].log_probabilities(scores)
+            logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
+            top = best_items(scores, min(SHOWN, scores.shape[1]))
+            hits[n, part] = (top == items[part]).any(1).numpy()
         return [self._weigh(logs[n], hits[n]) for n in range(len(rules))]
 
     def _weigh(self, logs: Float64Array, hits: BoolArray) -> Evidence:
@@ -149,10 +150,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     def rank(weights: Sequence[float]) -> RankedRule:
         rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
-        tops = list[list[Tensor]]()
-        for _, batch in logged.score(rules):
-            tops.append([best_items(values, min(SHOWN, n_items)) for values in batch])
-        for rule, *parts in zip(rules, *tops, strict=True):
+        tops = [list[Tensor]() for _ in rules]
+        for _, n, scores in logged.score(rules):
+            tops[n].append(best_items(scores, min(SHOWN, n_items)))
+        for rule, parts in zip(rules, tops, strict=True):
             top = torch.cat(parts).numpy()
             hits = (top == logged.items[:, None]).any(1)
             # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.

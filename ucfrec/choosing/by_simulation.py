@@ -53,6 +53,8 @@ _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
+_SCORES_AT_ONCE: Final = 2**24
+"""Most scores of a forward pass, rows × items: 64 MiB."""
 _NEAR_THE_LOG: Final = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
@@ -94,7 +96,8 @@ class _ManyRules(PolicyActor):
         self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         decisions = []
-        for batch in _batch_rules(self._rule[rows.numpy()]):
+        most = max(1, _SCORES_AT_ONCE // self._n_items)
+        for batch in _batch_rules(self._rule[rows.numpy()], most):
             begin, windows = batch[0][1].start, list[Windows]()
             # Windows depend on the rule's targets alone.
             for _, rules in groupby(batch, lambda entry: self._targets[entry[0]]):
@@ -114,16 +117,19 @@ class _ManyRules(PolicyActor):
         return torch.cat(items), torch.cat(chances)
 
 
-def _batch_rules(rules: IntArray) -> list[list[tuple[int, slice]]]:
-    """Whole rules of about `_ROWS_AT_ONCE` rows, and where they are among the sorted rules (M,)."""
+def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:
+    """Rules, in parts of at most `most` rows, and where they are among the sorted rules (M,), in
+    batches of about `_ROWS_AT_ONCE` rows, or as many as one part."""
     numbers, first = np.unique(rules, return_index=True)
     batches, size = [list[tuple[int, slice]]()], 0
     for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
-        if size and size + end - begin > _ROWS_AT_ONCE:
-            batches.append([])
-            size = 0
-        batches[-1].append((int(rule), slice(int(begin), int(end))))
-        size += int(end - begin)
+        for start in range(int(begin), int(end), most):
+            stop = min(start + most, int(end))
+            if size and size + stop - start > min(_ROWS_AT_ONCE, most):
+                batches.append([])
+                size = 0
+            batches[-1].append((int(rule), slice(start, stop)))
+            size += stop - start
     return batches
 
 

@@ -486,12 +486,8 @@ class ActionGenerator:
             mean_change=float(change.mean()) if len(change) else 0.0,
             earns_more=float((change > 0).mean()) if len(change) else 0.0,
         )
-        none, no_states = np.zeros(0, dtype=np.int64), np.zeros((0, view.state_size), np.float32)
         copies = AugmentedEpisodes(
-            copy_source=none,
-            edit_copy=none,
-            edit_step=none,
-            edit_state=no_states,
+            edit_state=np.zeros((0, view.state_size), np.float32),
             action_source=view.episode_ids[episodes[copied]],
             action_step=steps[copied],
             action=actions[accepted],

@@ -323,7 +323,13 @@ def fit_crm(
     torch.manual_seed(seed)
     model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
     model = model.to(device)
-    _set_statistics(model, train)
+    for name in ("state", "action", "reward"):
+        values = getattr(train, f"{name}s").double()
+        average, std = values.mean(dim=0), values.std(dim=0, correction=0)
+        # Rounding errors become 0.
+        std = torch.where(std > _CONSTANT * average.abs().clamp(min=1.0), std, 0.0)
+        model.get_buffer(f"{name}_mean").copy_(average)
+        model.get_buffer(f"{name}_std").copy_(std)
     if mean is None and (folder / INITIAL).exists():
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first and mean is None:
@@ -496,16 +502,6 @@ def _warning(report: CRMReport) -> str:
             "so it is not a disturbance, and edits that change the reward may pass the gate"
         )
     return ""
-
-
-def _set_statistics(model: CausalRewardModel, train: Transitions) -> None:
-    """Means and standard deviations, in float64; of the latter, rounding errors become 0."""
-    for name in ("state", "action", "reward"):
-        values = getattr(train, f"{name}s").double()
-        mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
-        std = torch.where(std > _CONSTANT * mean.abs().clamp(min=1.0), std, 0.0)
-        model.get_buffer(f"{name}_mean").copy_(mean)
-        model.get_buffer(f"{name}_std").copy_(std)
 
 
 def _sample(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:

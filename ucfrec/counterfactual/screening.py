@@ -26,6 +26,7 @@ from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.processes import progress, random_state_kept
+from ucfrec.user_model.reward_report import draw_numbers
 
 CLIP: Final = 10.0
 """Standardised values beyond this many standard deviations are clipped."""
@@ -210,8 +211,7 @@ def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntA
     """Episodes and steps (N,), not the last of their session; of more than `most`, so many."""
     episodes, steps = view.all_steps()
     inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
-    if len(inner) > most:
-        inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
+    inner = inner[draw_numbers(len(inner), most, seed)]
     return episodes[inner], steps[inner]
 
 

@@ -1,6 +1,6 @@
 """Terms added to the logits of items that resemble what a session was shown lately."""
 
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
 _DENSE = 2**24
 """Entries of the largest matrix of items and tags that is kept dense, which is faster."""
+_NEIGHBOURS: Final = ("lower", "higher")
 _FEW_TAGS = 256
 """Tags up to which a dense matrix of the tags of some items is faster than a sparse one."""
 
@@ -84,15 +85,6 @@ class Likeness(nn.Module):
         empty = spread.new_zeros(items.shape[0], padding + 1)
         return empty.scatter_add(1, places, spread)[:, :-1]
 
-    def to_all(self, profile: Tensor) -> Tensor:
-        """Likeness (M, n_items) of all items to profiles (M, F)."""
-        if not self.tags.shape[1]:
-            return profile @ self.directions.T
-        matrix = self._tag_matrix()
-        if matrix.is_sparse:
-            return cast("Tensor", torch.sparse.mm(matrix, profile.T)).T
-        return profile @ matrix.T
-
     def added_to(self, values: Tensor, profile: Tensor, items: Tensor | None = None) -> Tensor:
         """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`
         (L,) int64; None for all items."""
@@ -101,7 +93,10 @@ class Likeness(nn.Module):
             if not self.tags.shape[1]:
                 directions = self.directions if items is None else self.directions[items]
                 return values.addmm_(profile, directions.T)
-            matrix = self._tag_matrix() if items is None else self._tags_of(items)
+            if items is None:
+                matrix = self._tag_matrix()
+            else:  # sparse if a product with them is then cheaper
+                matrix = self._matrix_of(self.tags[items], self._count() <= _FEW_TAGS)
             if matrix.is_sparse:
                 return values.add_(cast("Tensor", torch.sparse.mm(matrix, profile.T)).T)
             return values.addmm_(profile, matrix.T)
@@ -128,7 +123,7 @@ class Likeness(nn.Module):
 
     def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
         """Likeness (M, D) by tags to the D different sets of tags, and the set of every item: what
-        `to_all` gives, faster where there are few profiles and many items of the same tags."""
+        `added_to` adds, faster where there are few profiles and many items of the same tags."""
         if self._sets is None:
             # Padding reads a place of its own, which is 0.
             tags = self.tags.cpu().numpy()
@@ -139,10 +134,6 @@ class Likeness(nn.Module):
         padded = nn.functional.pad(profile, (0, 1))
         columns = [padded.index_select(1, column) for column in self._sets[0].unbind(1)]
         return torch.stack(columns).sum(0), self._sets[1]
-
-    def _tags_of(self, items: Tensor) -> Tensor:
-        """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
-        return self._matrix_of(self.tags[items], self._count() <= _FEW_TAGS)
 
     def _tag_matrix(self) -> Tensor:
         """(n_items, n_tags), 1 where the item has the tag; sparse if it has many entries."""
@@ -234,14 +225,11 @@ class ExposureTerm(nn.Module):
 
 def quantiles(values: Float32Array, levels: Float64Array) -> Float64Array:
     """`np.quantile` in float64 of one value or more, without a copy of all of them in float64."""
-    places = levels * (len(values) - 1)
-    below = np.floor(places).astype(np.int64)
-    above = np.minimum(below + 1, len(values) - 1)
-    ordered = np.partition(values, np.union1d(below, above))
-    low, high = ordered[below].astype(np.float64), ordered[above].astype(np.float64)
-    share = places - below
+    low, high = (np.quantile(values, levels, method=way).astype(float) for way in _NEIGHBOURS)
+    share = levels * (len(values) - 1) % 1
     # As numpy interpolates, from the nearer value.
-    return np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))
+    near_low, near_high = low + (high - low) * share, high - (high - low) * (1 - share)
+    return np.asarray(np.where(share < 0.5, near_low, near_high))
 
 
 def columns_of(items: Tensor, among: Tensor) -> Tensor:

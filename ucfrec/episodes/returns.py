@@ -72,7 +72,9 @@ class ReturnToGo:
         if self.definition == "horizon":
             reached = np.minimum(steps + self.horizon, ends)
             return np.asarray(sums[reached] - sums[:-1], dtype=np.float32)
-        return _rest(sums, offsets)
+        starts = np.repeat(offsets[:-1], lengths)
+        totals, collected = sums[ends] - sums[starts], sums[:-1] - sums[starts]
+        return np.asarray(totals - collected, dtype=np.float32)
 
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
         """Target returns (B,) float64 at the next step, in reward units, of a `target` of the
@@ -114,23 +116,12 @@ def returns_in_parts(
     rewards: npt.NDArray[np.floating], offsets: IntArray, steps: int
 ) -> Iterator[Float32Array]:
     """`ReturnToGo().of_logs` in parts of about `steps` steps, to save memory."""
-    begin, total = 0, 0.0
+    begin = 0
     while begin < len(offsets) - 1:
-        end = int(np.searchsorted(offsets, offsets[begin] + steps))
-        end = min(max(end, begin + 1), len(offsets) - 1)
-        part = rewards[offsets[begin] : offsets[end]].astype(np.float64)
-        # Sums go on where those of the part before ended, so that they round alike.
-        sums = np.cumsum(np.concatenate([[total], part]))
-        yield _rest(sums, offsets[begin : end + 1] - offsets[begin])
-        begin, total = end, float(sums[-1])
-
-
-def _rest(sums: Float64Array, offsets: IntArray) -> Float32Array:
-    """Rest of each episode, from the sums (N + 1,) of all rewards before each step."""
-    lengths = np.diff(offsets)
-    starts, ends = np.repeat(offsets[:-1], lengths), np.repeat(offsets[1:], lengths)
-    totals, collected = sums[ends] - sums[starts], sums[:-1] - sums[starts]
-    return np.asarray(totals - collected, dtype=np.float32)
+        end = max(int(np.searchsorted(offsets, offsets[begin] + steps)), begin + 1)
+        part = offsets[begin : end + 1]
+        yield ReturnToGo().of_logs(rewards[part[0] : part[-1]], part - part[0])
+        begin = end
 
 
 def _discount(

@@ -89,9 +89,12 @@ class ItemStates:
                 f"rewards from {low!r:.60} to {high!r:.60} cannot be scaled to [0, 1]; "
                 "reward_low must be below reward_high"
             )
-        # Index −1 ("no item", "unknown user") selects this last row of zeros.
-        object.__setattr__(self, "_items", _add_zero_row(self.embeddings))
-        object.__setattr__(self, "_users", _add_zero_row(self.user_features))
+        # Index −1 ("no item", "unknown user") selects a last row of zeros. Embeddings are the rows
+        # before it, so that a large catalogue is in memory once.
+        items = F.pad(self.embeddings.float(), (0, 0, 0, 1))
+        object.__setattr__(self, "_items", items)
+        object.__setattr__(self, "embeddings", items[:-1])
+        object.__setattr__(self, "_users", F.pad(self.user_features.float(), (0, 0, 0, 1)))
         decays = [self.decay**lag for lag in reversed(range(self.window))]
         object.__setattr__(self, "_decays", torch.tensor(decays))
 
@@ -167,10 +170,6 @@ def _is_real(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _add_zero_row(table: Tensor) -> Tensor:
-    return torch.cat([table.float(), torch.zeros(1, table.shape[1])])
-
-
 def least_liked(low: _Reward, high: _Reward) -> _Reward:
     """The lowest reward of a liked step, where training rewards are from `low` to `high`."""
     return low + LIKED * (high - low)
@@ -207,20 +206,20 @@ class TrainingCounts:
         """
         names, n_items = [schema.ITEM, schema.REWARD], len(train.item_states.embeddings)
         timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
-        impressions, liked = np.zeros((2, n_items), dtype=np.float64 if timed else np.int64)
+        shown, liked = np.zeros((2, n_items))
         if timed:
             names.append(schema.TIMESTAMP)
             last = int(train.column(schema.TIMESTAMP).max())
         for items, rewards, *times in train.column_batches(*names):
-            weights = None
+            weights = np.ones(len(items))
             if timed:
-                age = last - times[0].astype(np.int64)
-                weights = np.exp2(-age / (half_life * _HOUR_MS))
-            impressions += np.bincount(items, weights, n_items)
-            is_liked = liked_of(train, rewards)
-            weights = weights if weights is None else weights[is_liked]
-            liked += np.bincount(items[is_liked], weights, n_items)
-        return cls(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
+                weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
+            shown += np.bincount(items, weights, n_items)
+            liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
+        counts = torch.from_numpy(np.stack([shown, liked])).to(
+            torch.float64 if timed else torch.int64
+        )
+        return cls(counts[0], counts[1], train.n_episodes)
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""

@@ -26,8 +26,6 @@ _DTYPES: Final = {
     **schema.EPISODE_DTYPES,
 }
 _BATCH_STEPS = 2**20
-_LONG_ENOUGH = 1000
-"""Mean number of steps from which consecutive steps are read as slices."""
 
 
 class StepColumn:
@@ -57,17 +55,6 @@ class StepColumn:
             for i, part in enumerate(self.parts):
                 in_shard = shard == i
                 values[in_shard] = part[index[in_shard] - self._bounds[i]]
-        return values if self._dimensions is None else values[..., self._dimensions]
-
-    def between(self, begin: int, end: int) -> Array:
-        """The values from index `begin` to before `end`; of one shard, without a copy."""
-        first = int(np.searchsorted(self._bounds, begin, side="right")) - 1
-        last = int(np.searchsorted(self._bounds, end, side="left"))
-        parts = [
-            np.asarray(part[max(begin - low, 0) : end - low])
-            for part, low in zip(self.parts[first:last], self._bounds[first:last], strict=True)
-        ]
-        values = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return values if self._dimensions is None else values[..., self._dimensions]
 
 
@@ -379,21 +366,8 @@ class EpisodeView:
 
     def column_batches(self, *names: str) -> Iterator[tuple[Array, ...]]:
         """Step columns at `all_steps`, some steps at a time."""
-        if not self.n_steps:
-            return
-        ends = (self._columns.starts + self._columns.lengths)[self.episode_ids]
-        begins = ends - self._counts
-        apart = begins[1:] != ends[:-1]
-        begins, ends = begins[np.append(True, apart)], ends[np.append(apart, True)]
-        if len(begins) > self.n_steps // _LONG_ENOUGH:
-            for episodes, steps in self.step_batches():
-                yield tuple(self.step_values(name, episodes, steps) for name in names)
-            return
-        columns = [self._columns.step_column(name) for name in names]
-        for begin, end in zip(begins, ends, strict=True):
-            for first in range(begin, end, _BATCH_STEPS):
-                last = min(first + _BATCH_STEPS, end)
-                yield tuple(column.between(first, last) for column in columns)
+        for episodes, steps in self.step_batches():
+            yield tuple(self.step_values(name, episodes, steps) for name in names)
 
     def item_counts(self) -> IntArray:
         """(n_items,) number of steps of the view that show each item; for stores of items only."""

@@ -119,10 +119,6 @@ class Transitions:
         """The steps on `device`."""
         return _each(self, lambda values: values.to(device))
 
-    def __repr__(self) -> str:
-        (steps, size), action = self.states.shape, self.actions.shape[1]
-        return f"Transitions({steps:,} steps, states of {size}, actions of {action})"
-
 
 class Shown(NamedTuple):
     """What B sessions showed before a step."""
@@ -157,6 +153,13 @@ class Shown(NamedTuple):
         """The sessions with the given numbers."""
         return Shown(self.items[rows], self.rewards[rows])
 
+    def padded(self, steps: int) -> "Shown":
+        """What was shown in the latest `steps`, (B, `steps`), also where fewer are known."""
+        recent, pad = self.latest(steps), nn.functional.pad
+        if not (missing := steps - recent.items.shape[1]):
+            return recent
+        return Shown(pad(recent.items, (0, missing), value=-1), pad(recent.rewards, (0, missing)))
+
     def latest(self, steps: int) -> "Shown":
         """What was shown in the latest `steps` of these."""
         return Shown(self.items[:, :steps], self.rewards[:, :steps])
@@ -187,13 +190,8 @@ class Exposed:
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
         """For the last step of B windows, as `before`, (B, lags)."""
-        recent = Shown.before_last(windows.last(lags + 1))
-        missing = lags - recent.items.shape[1]
-        return cls(
-            nn.functional.pad(recent.items, (0, missing), value=-1),
-            nn.functional.pad(recent.rewards, (0, missing)),
-            windows.returns_to_go[:, -1],
-        )
+        recent = Shown.before_last(windows.last(lags + 1)).padded(lags)
+        return cls(*recent, windows.returns_to_go[:, -1])
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
@@ -375,14 +373,14 @@ class AugmentedEpisodes:
     would take S times the memory of its log, and an action copy K states for its one step.
     """
 
-    copy_source: IntArray
-    """(C,) number in the store of the episode that was copied."""
-    edit_copy: IntArray
-    """(M,) number of the copy, 0 to C − 1, that each edit belongs to."""
-    edit_step: IntArray
-    """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
     edit_state: Float32Array
     """(M, S) counterfactual states."""
+    copy_source: IntArray = field(default_factory=_no_integers)
+    """(C,) number in the store of the episode that was copied."""
+    edit_copy: IntArray = field(default_factory=_no_integers)
+    """(M,) number of the copy, 0 to C − 1, that each edit belongs to."""
+    edit_step: IntArray = field(default_factory=_no_integers)
+    """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
     action_source: IntArray = field(default_factory=_no_integers)
     """(N,) number in the store of the episode that an action copy is of."""
     action_step: IntArray = field(default_factory=_no_integers)
@@ -391,13 +389,6 @@ class AugmentedEpisodes:
     """(N,) int64 items or (N, A) float32 vectors: the other actions."""
     action_reward: Float32Array = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
     """(N,) their rewards, in reward units."""
-
-    def __repr__(self) -> str:
-        edits, size = self.edit_state.shape
-        return (
-            f"AugmentedEpisodes({len(self.copy_source):,} copies, {edits:,} edited states of "
-            f"{size}, {len(self.action_source):,} action copies)"
-        )
 
     def join(self, episodes: "AugmentedEpisodes") -> "AugmentedEpisodes":
         """These episodes, followed by others."""

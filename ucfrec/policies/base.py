@@ -193,13 +193,12 @@ class SequencePolicy(nn.Module, ABC):
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
             return values.flatten(0, 1) if padded is None else values[padded]
 
-        features, actions = steps(features), steps(windows.actions)
+        losses = self.head.losses(steps(features), steps(windows.actions), exposed)
         if self.values is None:
-            value = self.head.loss(features, actions, exposed)
+            value = losses.mean()
             return value, {"action_loss": value.detach()}
         values = steps(self.values(windows, self.head.embed(windows.actions)))
         returns = steps(windows.returns_to_go)
-        losses = self.head.losses(features, actions, exposed)
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)
         action_loss, value_loss = losses.mean(), self.values.loss(values, returns)
@@ -210,7 +209,7 @@ class SequencePolicy(nn.Module, ABC):
         """Mean action loss over the windows' last steps, the validation loss."""
         normalized = self.normalize(windows)
         features, exposed = self.features(normalized)[:, -1], self.exposed(normalized, last=True)
-        return self.head.loss(features, windows.actions[:, -1], exposed)
+        return self.head.losses(features, windows.actions[:, -1], exposed).mean()
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""

@@ -15,12 +15,13 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Shown, Windows
 from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, draw_normal, embedding
 from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
-from ucfrec.user_model.session_end import LEAVES, TREES, fit_trees
+from ucfrec.user_model.reward_report import draw_numbers
+from ucfrec.user_model.session_end import LEAVES, TREES, BoostedTrees, fit_trees
 
 PRIOR: Final = 10.0
 """Steps at the mean rate that are added to every item's own."""
@@ -31,6 +32,8 @@ _SMOOTHING: Final = 1.0
 _WITHIN = 0.999
 """Largest share of an action's range that the hyperbolic tangent of the head is to reach."""
 _ROWS = 1024
+_AT_ONCE: Final = 2**24
+"""Largest number of pairs of an item with a row, or with another item, in memory at once."""
 _HOTTEST = 64.0
 """Largest factor on the cosines of neighbours."""
 _HALVINGS = 30
@@ -75,7 +78,15 @@ class BCPolicy(SequencePolicy):
         return self.net(windows.states)  # type: ignore[no-any-return]
 
 
-class PopularPolicy(SequencePolicy):
+class ScoringPolicy(SequencePolicy):
+    """Scores items in a way of its own, without features."""
+
+    def features(self, windows: Windows) -> Tensor:
+        """(B, K, d) of zeros."""
+        return windows.states.new_zeros((*windows.mask.shape, self.config.dim))
+
+
+class PopularPolicy(ScoringPolicy):
     """Scores items by their training rows, whatever the session shows: only biases matter.
 
     The score is the logarithm of the item's share of all `steps`, one step added to each item; the
@@ -121,10 +132,6 @@ class PopularPolicy(SequencePolicy):
             half_life = float(self.half_life)
         counts = TrainingCounts.of(train, half_life=half_life)
         self.head.get_parameter("bias").copy_(self.scores_of(counts))
-
-    def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) of zeros."""
-        return windows.states.new_zeros((*windows.mask.shape, self.config.dim))
 
     @classmethod
     def scores_of(cls, counts: TrainingCounts) -> Tensor:
@@ -202,7 +209,7 @@ class ItemKNNConfig(PolicyConfig):
     """Neighbours of each item, those with the highest cosines; at most the number of items."""
 
 
-class ItemKNNPolicy(SequencePolicy):
+class ItemKNNPolicy(ScoringPolicy):
     """Scores items by their cosines to the session's earlier items, weighted by their rewards.
 
     Cosines are between columns of the session × item matrix of rewards minus the lowest reward.
@@ -240,8 +247,9 @@ class ItemKNNPolicy(SequencePolicy):
         liked = sparse.csr_matrix((rewards - rewards.min(), (episodes, items)), shape=shape)
         lengths = np.sqrt(np.asarray(liked.multiply(liked).sum(axis=0))).ravel()
         columns = (liked @ sparse.diags(1 / np.where(lengths > 0, lengths, 1.0))).tocsc()
-        for start in range(0, shape[1], _ROWS):
-            rows = slice(start, start + _ROWS)
+        at_once = max(1, min(_ROWS, _AT_ONCE // shape[1]))
+        for start in range(0, shape[1], at_once):
+            rows = slice(start, start + at_once)
             cosines = torch.from_numpy((columns[:, rows].T @ columns).toarray()).float()
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
@@ -258,7 +266,7 @@ class ItemKNNPolicy(SequencePolicy):
         episodes, steps = held_out.locate(numbers)
         windows = held_out.windows(episodes, steps, self.config.context)
         windows = windows.to(self.cosines.device)
-        scores, items = self.features(windows)[:, -1], windows.actions[:, -1:]
+        scores, items = self.similarity(*Shown.before_last(windows)), windows.actions[:, -1:]
         of_shown = scores.gather(1, items).mean()
         assert isinstance(self.head, ItemHead)
         low, high = 0.0, _HOTTEST
@@ -267,15 +275,6 @@ class ItemKNNPolicy(SequencePolicy):
             expected = (middle * scores + self.head.bias).softmax(-1).mul(scores).sum(-1).mean()
             low, high = (low, middle) if expected > of_shown else (middle, high)
         self.temperature.fill_((low + high) / 2)
-
-    def features(self, windows: Windows) -> Tensor:
-        """Cosines to the earlier items, summed by rewards, (B, K, n_items), of raw windows."""
-        weights = (windows.rewards - self.reward_low) * windows.mask
-        weighted = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
-        scores = weighted.new_zeros((*windows.mask.shape, len(self.cosines)))
-        scores.scatter_add_(-1, self.neighbors[windows.actions], weighted)
-        # Row t sums earlier steps only. Subtracting step t from its sum would round.
-        return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
 
     def similarity(self, items: Tensor, rewards: Tensor) -> Tensor:
         """Cosines to items (B, N), −1 for none, summed by their rewards (B, N), (B, n_items)."""
@@ -291,10 +290,11 @@ class ItemKNNPolicy(SequencePolicy):
 
     def act(self, windows: Windows) -> Tensor:
         """Logits over items at the last step, (B, n_items)."""
-        return self.temperature * self.features(windows)[:, -1] + self.head.get_parameter("bias")
+        scores = self.similarity(*Shown.before_last(windows))
+        return self.temperature * scores + self.head.get_parameter("bias")
 
 
-class LikedPolicy(SequencePolicy):
+class LikedPolicy(ScoringPolicy):
     """Learns from which items were liked: from rewards of at least `least_liked`."""
 
     reward_low: Tensor
@@ -364,8 +364,12 @@ class BPRPolicy(LikedPolicy):
         liked = self.find_liked(windows)[:, -1] > 0
         if not bool(liked.any()):
             return windows.rewards.new_zeros(())
-        scores, items = self.act(windows)[liked], windows.actions[liked, -1:]
-        return -F.logsigmoid(scores.gather(1, items) - scores).mean()
+        rows = torch.nonzero(liked)[:, 0]
+        losses = []
+        for part in torch.split(rows, max(1, _AT_ONCE // len(self.of_history.weight))):
+            scores, items = self.act(windows.at(part)), windows.actions[part, -1:]
+            losses.append(-F.logsigmoid(scores.gather(1, items) - scores).mean(1))
+        return torch.cat(losses).mean()
 
 
 @settings_table("policy")
@@ -428,11 +432,7 @@ class BoostedPolicy(LikedPolicy):
         """Fits the trees."""
 
         def solve() -> None:
-            steps = np.arange(train.n_steps)
-            if len(steps) > _MAX_ROWS:
-                sample = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
-                steps = np.sort(sample)
-            inputs, liked = self._rows(train, steps)
+            inputs, liked = self._rows(train, draw_numbers(train.n_steps, _MAX_ROWS, seed))
             trees = fit_trees(inputs, liked, seed)
             self.base.copy_(trees["base"])
             count = len(trees["leaves"])
@@ -445,11 +445,10 @@ class BoostedPolicy(LikedPolicy):
     def _rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
         """Inputs (M, F) of the trees at training steps (M,), and which were liked."""
         folds = np.arange(train.n_episodes) % _FOLDS
-        whole, in_folds = torch.stack([self.impressions, self.liked]).cpu(), list[Tensor]()
-        for fold in range(_FOLDS):
-            of_fold = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
-            in_folds.append(whole - torch.stack([of_fold.shown, of_fold.liked]))
-        counts = torch.stack(in_folds, dim=1)  # (2, folds, n_items), without the fold
+        parts = (train.select(np.flatnonzero(folds == fold)) for fold in range(_FOLDS))
+        of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
+        whole = torch.stack([self.impressions, self.liked]).cpu()
+        counts = whole.unsqueeze(1) - torch.stack(of_folds, 1)  # (2, folds, n_items) of the others
         inputs, target = [], []
         for begin in range(0, len(numbers), _ROWS_AT_ONCE):
             episodes, steps = train.locate(numbers[begin : begin + _ROWS_AT_ONCE])
@@ -504,19 +503,10 @@ class BoostedPolicy(LikedPolicy):
     def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
-        scores = []
-        for rows in torch.split(inputs.flatten(0, 1), _ROWS_AT_ONCE):
-            columns = rows.T.contiguous()
-            which = torch.zeros(TREES, len(rows), dtype=torch.int64, device=rows.device)
-            for split in range(_SPLITS):
-                left = columns[self.split_inputs[split]] <= self.split_thresholds[split, :, None]
-                which |= left.long() << split
-            scores.append(self.leaves.gather(1, which).sum(0))
-        return self.base + torch.cat(scores).view(inputs.shape[:2])
-
-    def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) of zeros; the policy scores items in a way of its own."""
-        return windows.states.new_zeros((*windows.mask.shape, self.config.dim))
+        tables = self.split_inputs.T, self.split_thresholds.T, self.leaves, self.base
+        trees = BoostedTrees(*(table.cpu() for table in tables))
+        parts = torch.split(inputs.flatten(0, 1).cpu(), _ROWS_AT_ONCE)
+        return torch.cat([trees(rows) for rows in parts]).view(inputs.shape[:2]).to(inputs)
 
     @torch.no_grad()
     def act(self, windows: Windows) -> Tensor:

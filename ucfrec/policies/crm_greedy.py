@@ -56,13 +56,11 @@ class CRMGreedyPolicy(SequencePolicy):
         """For vectors, set the candidates, and the mean and standard deviation of the rewards."""
         if not isinstance(self.head, VectorHead):
             return
-        episodes, steps = train.all_steps()
-        rewards = train.step_values(schema.REWARD, episodes, steps)
+        rewards, actions = train.column(schema.REWARD), train.column(schema.ACTION)
         self.reward_mean.fill_(float(rewards.mean()))
         self.reward_std.fill_(max(float(rewards.std()), 1e-6))
-        sample = np.random.default_rng(0).integers(len(episodes), size=_CANDIDATES)
-        actions = train.step_values(schema.ACTION, episodes[sample], steps[sample])
-        self.candidates.copy_(torch.from_numpy(actions))
+        sample = np.random.default_rng(0).integers(len(actions), size=_CANDIDATES)
+        self.candidates.copy_(torch.from_numpy(actions[sample]))
 
     def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int

@@ -61,11 +61,7 @@ class DTPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        return self.transform(windows)[:, 1::3]
-
-    def transform(self, windows: Windows) -> Tensor:
-        """Outputs at all tokens R_0, s_0, a_0, R_1, …, (B, 3K, d), from normalised windows."""
-        return self.attend(self.tokens(windows), windows.mask)
+        return self.attend(self.tokens(windows), windows.mask)[:, 1::3]
 
     def tokens(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens R_t, s_t and a_t, (B, K, d) each, from normalised windows."""
@@ -74,8 +70,8 @@ class DTPolicy(SequencePolicy):
     def attend(
         self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor, rows: slice | None = None
     ) -> Tensor:
-        """Outputs (B, 3K, d) at tokens of `tokens`, or the `rows` of them alone; `mask` (B, K) is
-        false at padding."""
+        """Outputs (B, 3K, d) at the tokens R_0, s_0, a_0, R_1, …, or the `rows` of them alone;
+        `mask` (B, K) is false at padding."""
         hidden = self.dropout(interleave(tokens))
         visible = visible_tokens(mask.repeat_interleave(3, dim=1))
         return self.final_norm(pass_rows(self.blocks, hidden, visible, rows))  # type: ignore[no-any-return]
@@ -183,7 +179,7 @@ class CDT4RecPolicy(DTPolicy):
 
     def estimate_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
         """Estimates (B, K) of the logged actions' standardised rewards, from outputs (B, 3K, d) of
-        `transform`; the mask (B, K) is false at padding."""
+        `attend`; the mask (B, K) is false at padding."""
         states, actions = hidden[:, 1::3], hidden[:, 2::3]
         hidden_keys = ~visible_tokens(mask)[:, 0]  # (B, K, K)
         attended, _ = self.attention(
@@ -198,7 +194,7 @@ class CDT4RecPolicy(DTPolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted reward loss over all steps, and scalars to log."""
         mask, normalized = windows.mask, self.normalize(windows)
-        hidden = self.transform(normalized)
+        hidden = self.attend(self.tokens(normalized), mask)
         imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
         rewards = (windows.rewards - self.reward_mean) / self.reward_std
         reward_loss = (self.estimate_rewards(hidden, mask) - rewards).square()[mask].mean()

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.reward_model import mlp
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Exposed, Transitions, Windows
 from ucfrec.fitting.loop import LoopConfig, fit
@@ -53,10 +55,9 @@ class ConservativeQ(nn.Module):
         super().__init__()
         self.weight = weight
         mean, std = store.state_statistics
-        episodes, steps = store.all_steps()
-        sample = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
-        column = schema.ITEM if store.has_items else schema.ACTION
-        logged = torch.from_numpy(store.step_values(column, episodes[sample], steps[sample]))
+        count, column = store.n_steps, schema.ITEM if store.has_items else schema.ACTION
+        sample = np.linspace(0, count - 1, min(count, _LOGGED)).astype(np.int64)
+        logged = torch.from_numpy(store.step_values(column, *store.locate(sample)))
         vectors = store.action_vectors(logged.long() if store.has_items else logged)
         every = store.item_states.embeddings if store.has_items else None
         self.register_buffer("state_mean", mean)
@@ -140,13 +141,13 @@ def relabel(
     fit(network, draw, network.loss, loop, folder, seed=seed, describe="cql")
     torch.manual_seed(seed)
     episodes, numbers = store.all_steps()
-    values = np.empty(len(numbers), dtype=np.float64)
+    parts = []
     with torch.no_grad():
         for begin in range(0, len(numbers), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
             states = store.windows(episodes[part], numbers[part], 1).states[:, 0]
-            values[part] = (network.state_values(states) * network.unit).numpy()
-    rewards = store.step_values(schema.REWARD, episodes, numbers)
+            parts.append((network.state_values(states) * network.unit).double().numpy())
+    rewards, values = store.column(schema.REWARD), np.concatenate(parts)
     return store.with_returns_to_go(optimistic_returns(rewards, values, store.lengths))
 
 
@@ -167,10 +168,7 @@ def optimistic_returns(
     next_values = np.append(values[1:], 0.0)
     next_values[ends - 1] = 0.0
     attainable = next_values + (total - first)  # V_{t+1} + C_{t+1}
-    # An offset that grows with the episode index makes the running maximum restart per episode.
-    offset = float(np.ptp(attainable)) + 1.0
-    separated = attainable - owner * offset
-    highest = np.maximum.accumulate(separated[::-1])[::-1] + owner * offset
+    highest = pd.Series(attainable[::-1]).groupby(owner[::-1]).cummax().to_numpy()[::-1]
     return np.asarray(highest - (earlier - first), dtype=np.float32)
 
 
@@ -262,10 +260,6 @@ class GaussianHead(VectorHead):
         """Log standard deviations (..., A) from features (..., d), clamped to [−5, 2]."""
         return self.log_deviation(features).clamp(-5.0, 2.0)  # type: ignore[no-any-return]
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M, A)."""
-        return self.losses(features, actions).mean()
-
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Negative log-likelihood (nats) of each of M steps, (M,)."""
         log_deviation = self.deviations(features)
@@ -282,7 +276,5 @@ class GaussianHead(VectorHead):
 def _consistent(windows: Windows) -> Windows:
     """The windows with returns-to-go that decrease by each step's reward to the last step's value,
     as in acting; relabelled ones of adjacent steps need not."""
-    rewards = windows.rewards[:, :-1].flip(1).cumsum(1).flip(1)  # r_t + … + r_{last − 1}
-    last = windows.returns_to_go[:, -1:]
-    returns = torch.cat([last + rewards, last], dim=1).masked_fill(~windows.mask, 0.0)
-    return replace(windows, returns_to_go=returns)
+    returns = ReturnToGo().before(windows.returns_to_go[:, -1], windows.rewards)
+    return replace(windows, returns_to_go=returns.masked_fill(~windows.mask, 0.0))

@@ -1,6 +1,6 @@
 """Action heads, which embed and predict actions, vectors or items."""
 
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -59,12 +59,9 @@ class VectorHead(nn.Module):
         """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Mean squared error over M steps in units of `scale`: features (M, d), actions (M, A)."""
-        return F.mse_loss(self.predict(features) / self.scale, actions / self.scale)
-
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """The squared error of each of M steps, (M,), whose mean is `loss`."""
+        """The mean squared error (M,) of each of M steps in units of `scale`, from features (M, d)
+        and actions (M, A)."""
         error = (self.predict(features) - actions) / self.scale
         return error.square().mean(-1)
 
@@ -107,8 +104,9 @@ class ItemHead(nn.Module):
         self._proposal: Proposal | None = None
 
     def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
-        """Set the embeddings (n_items, D) and, from training counts (n_items,), the bias."""
-        self.embeddings.copy_(embeddings)
+        """Set the embeddings (n_items, D), which are not copied, and, from training counts
+        (n_items,), the bias."""
+        self.embeddings = embeddings.to(self.embeddings)
         self.counts.copy_(counts + 1)
         self._proposal = None
         with torch.no_grad():
@@ -149,25 +147,27 @@ class ItemHead(nn.Module):
             return self.vectors(items)
         return F.embedding(items, self.all_vectors())
 
-    def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Logits over all items (..., n_items) from features (..., d), or (M, d) with what was
-        shown before the M steps, which an exposure term needs."""
-        return self._logits(features, self.all_vectors(), self.bias, None, exposed)
-
-    def predict_items(
-        self, features: Tensor, items: Tensor, exposed: Exposed | None = None
+    def predict(
+        self,
+        features: Tensor,
+        exposed: Exposed | None = None,
+        items: Tensor | None = None,
+        offset: Tensor | float = 0.0,
     ) -> Tensor:
-        """The columns (M, L) of `predict` of `items` (L,), ascending, each once."""
-        return self._logits(features, self.embed(items), self._gather_bias(items), items, exposed)
-
-    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
-        if self.samples:
-            return self.losses(features, actions, exposed).mean()
-        return F.cross_entropy(self.predict(features, exposed), actions)
+        """Logits over all items (..., n_items) from features (..., d), or (M, d) with what was
+        shown before the M steps, which an exposure term needs; or those (M, L) over `items` (L,),
+        ascending, each once, plus an `offset` (L,)."""
+        vectors = self.all_vectors() if items is None else self.embed(items)
+        bias = self.bias if items is None else self._gather_bias(items) + offset
+        # Scaling the features instead of the logits saves two passes over the larger of them.
+        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
+        if self.exposure is not None and exposed is not None:
+            return self.exposure.added_to(logits, exposed, items)
+        return logits
 
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """The negative log-likelihood (nats) of each of M steps, (M,), whose mean is `loss`."""
+        """The negative log-likelihood (nats) of each of M steps, (M,): features (M, d), actions
+        (M,)."""
         if not self.samples:
             return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
         logit = self.logit(features, actions, exposed)
@@ -175,7 +175,7 @@ class ItemHead(nn.Module):
             # The softmax over all items, some at once.
             items = torch.arange(len(self.counts), device=features.device)
             parts = [
-                self.predict_items(features, part, exposed).logsumexp(-1)
+                self.predict(features, exposed, part).logsumexp(-1)
                 for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
             ]
             return torch.stack(parts).logsumexp(0) - logit
@@ -197,20 +197,6 @@ class ItemHead(nn.Module):
         estimate: Tensor = -(logs.exp() * (logs - log_weights)).sum(-1).mean()
         return estimate
 
-    def _logits(
-        self,
-        features: Tensor,
-        vectors: Tensor,
-        bias: Tensor,
-        items: Tensor | None,
-        exposed: Exposed | None,
-    ) -> Tensor:
-        # Scaling the features instead of the logits saves two passes over the larger of them.
-        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
-        if self.exposure is not None and exposed is not None:
-            return self.exposure.added_to(logits, exposed, items)
-        return logits
-
     def _sample_logits(
         self, features: Tensor, exposed: Exposed | None
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -218,9 +204,7 @@ class ItemHead(nn.Module):
         if self._proposal is None or self._proposal.share.device != self.counts.device:
             self._proposal = Proposal(self.counts)
         items, log_weights = self._proposal.draw(self.samples)
-        bias = self._gather_bias(items) + log_weights
-        logits = self._logits(features, self.vectors(items), bias, items, exposed)
-        return items, logits, log_weights
+        return items, self.predict(features, exposed, items, log_weights), log_weights
 
     def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
         """Logits (M,) of the logged items."""
@@ -232,10 +216,6 @@ class ItemHead(nn.Module):
 
     def _gather_bias(self, items: Tensor) -> Tensor:
         return torch.gather(self.bias, 0, items, sparse_grad=True)
-
-    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
-        super()._load_from_state_dict(*arguments, **options)
-        self._proposal = None
 
 
 Head = VectorHead | ItemHead

@@ -90,25 +90,19 @@ class GSASRecPolicy(SASRecPolicy):
         valid = windows.mask
         features, actions = self.features(normalized)[valid], windows.actions[valid]
         exposed = self.exposed(normalized, valid)
-        items = self._draw(len(head.bias))
-        rate = min(1.0, (len(items) - 1) / max(1, len(head.bias) - 1)) or 1.0
+        n_items, negatives, device = len(head.bias), self.config.negatives, features.device
+        items = torch.arange(n_items, device=device)  # of a small catalogue, all
+        if n_items > negatives:
+            items = torch.unique(torch.randint(n_items, (negatives,), device=device))
+        rate = min(1.0, (len(items) - 1) / max(1, n_items - 1)) or 1.0
         t = self.config.calibration
         beta = rate * (t * (1 - 1 / rate) + 1 / rate)
         # Where the bias is the log share of an item, the scores are the loss's best ones.
         offset = math.log(beta / rate)
-        negative = head.predict_items(features, items, exposed) + offset
+        negative = head.predict(features, exposed, items) + offset
         positive = head.logit(features, actions, exposed) + offset
         is_negative = items != actions.unsqueeze(1)
         against = (F.softplus(negative) * is_negative).sum(1)
         losses = (against - beta * F.logsigmoid(positive)) / (len(items) + 1)
         value = losses.mean()
         return value, {"gbce_loss": value.detach()}
-
-    def _draw(self, n_items: int) -> Tensor:
-        """Items (L,), ascending, each once: k uniform ones, or all of a small catalogue."""
-        device = self.state_mean.device
-        if n_items <= self.config.negatives:
-            return torch.arange(n_items, device=device)
-        sample = torch.randint(n_items, (self.config.negatives,), device=device)
-        items: Tensor = torch.unique(sample)
-        return items

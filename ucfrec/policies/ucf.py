@@ -18,6 +18,7 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
+    embed_time,
     embedding,
     require_heads,
     some_padding,
@@ -273,9 +274,7 @@ class TokenEmbedding(nn.Module):
     def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Embedded time, returns-to-go and states, (B, K, d) each."""
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        return time, returns, self.embed_state(windows.states)
+        return embed_time(self.embed_timestep, windows), returns, self.embed_state(windows.states)
 
 
 def interleave(modalities: Sequence[Tensor]) -> Tensor:

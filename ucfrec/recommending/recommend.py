@@ -27,8 +27,9 @@ SCORE: Final = "score"
 SIMILAR_ITEM: Final = "similar_item_id"
 _USERS_AT_ONCE: Final = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
-_SCORES: Final = 2**24
-"""Most scores of a forward pass of several users, users × items: 64 MiB."""
+_SCORES: Final = 2**23
+"""Most scores of a forward pass of several users, users × items: 32 MiB, as memory for more is
+given back after every pass, and asking for it anew takes as long as the product."""
 _ITEMS_AT_ONCE: Final = 1024
 _NEGLIGIBLE: Final = 80.0
 """Nats below the best score from which on an item counts nothing, in float32."""
@@ -200,14 +201,16 @@ class Chooser:
         if rule.draws:
             draws = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
         with torch.inference_mode():
-            # Exponentials that underflow take long; what is lower adds nothing to a sum from 1 on.
-            lowest = scores.amax(-1, keepdim=True) - _NEGLIGIBLE
-            total = scores.clamp(min=lowest).logsumexp(-1, keepdim=True)
-            none = torch.isneginf(total)
+            highest = scores.amax(-1, keepdim=True)
+            none = torch.isneginf(highest)
             if none.any():
-                scores[none[:, 0]] = 0.0
+                scores[none[:, 0]] = highest[none] = 0.0
             items, propensities = rule.rank_items(scores, k, draws)
-            values = (scores.gather(1, items) - total).masked_fill(none, -torch.inf)
+            values = scores.gather(1, items)
+            # In place, as memory for another copy of the scores takes longer than their sums.
+            # Exponentials that underflow take long; what is lower adds nothing to a sum from 1 on.
+            totals = scores.sub_(highest).clamp_(min=-_NEGLIGIBLE).exp_().sum(-1, keepdim=True)
+            values = values.sub_(totals.log_().add_(highest)).masked_fill_(none, -torch.inf)
             return items.numpy(), values.numpy(), propensities.numpy()
 
 

@@ -35,6 +35,7 @@ from ucfrec.files.atomic import (
     write_json,
 )
 from ucfrec.fitting import distributed
+from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import note_ignored
@@ -58,7 +59,15 @@ from ucfrec.runs.start import (
     start_warm,
     training_views,
 )
-from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.trained_policy import (
+    AUGMENTATION,
+    INPUTS,
+    RETURNS,
+    REWARD_MODEL,
+    RULE,
+    TrainedPolicy,
+    read_rule,
+)
 from ucfrec.user_model.model import UserModel
 
 SAMPLES: Final = "samples.json"
@@ -202,6 +211,7 @@ def train_run(
                 with phase("Selecting the decision rule", 4, 4):
                     rule = _choose_rule(run, users, initial)
                 record = record.copy_with(reward_model=users.reward_report, rule=rule)
+                del users  # what follows reads the reward model of the run
             scorer = TrainedPolicy.load(out, in_training=True).scorer()
             write_json(out / SAMPLES, sample_recommendations(scorer, run.held_out))
         seconds = record.wall_time_s + time.perf_counter() - start
@@ -291,10 +301,15 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
 
 def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
     """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
-    trained = TrainedPolicy.load(run.out, in_training=True)
-    states, returns, config = trained.item_states, trained.record.return_to_go, run.config.rule
+    states, returns, config = run.logged.item_states, run.record.return_to_go, run.config.rule
+    # What `TrainedPolicy.load` reads, but for a second policy and a second table of items.
+    values, _ = load_tensors(run.out / RETURNS)
+    rule, no_users = read_rule(run.out / RULE), np.zeros(0, dtype=np.int64)
+    trained = TrainedPolicy(
+        run.out, run.policy, run.record, states, None, no_users, values["returns"].numpy(), rule
+    )
     problem = Problem(
-        Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
+        Scorer(run.policy, rule, states, returns, users.reward, users.session_end),
         users,
         {quantile: trained.target_return(quantile) for quantile in config.quantiles},
         run.logged.without_long_sessions(),

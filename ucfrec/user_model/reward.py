@@ -162,12 +162,12 @@ class ItemRewardModel(nn.Module):
             users: (B,) int64 numbers in the training store, −1 if unknown; None if all are.
         """
         items, repeated, alike = self.exposures(history)
-        added = self.likeness.to_all(self.likeness.profile(items, alike))
-        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
-        added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
         tastes = self.tastes_after(history)
-        added = added + self.query(states, users, tastes) @ self.vectors.T
-        return self.item + self.level(states, users, tastes).unsqueeze(1) + added
+        scores = self.item + self.query(states, users, tastes) @ self.vectors.T
+        scores = self.likeness.added_to(scores, self.likeness.profile(items, alike))
+        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
+        scores = scores.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
+        return scores + self.level(states, users, tastes).unsqueeze(1)
 
     def score(self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
@@ -236,7 +236,7 @@ class ItemRewardModel(nn.Module):
 
     def standardise(self, states: Tensor) -> Tensor:
         """States (..., S) in standard deviations from their training mean, clipped."""
-        return ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
+        return (states - self.state_mean).div_(self.state_std).clamp_(-CLIP, CLIP)
 
     def scale_rewards(self, rewards: Tensor) -> Tensor:
         """Rewards (...) on a scale from 0 to 1."""
@@ -244,9 +244,8 @@ class ItemRewardModel(nn.Module):
 
     def exposures(self, history: Shown) -> tuple[Tensor, Tensor, Tensor]:
         """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
-        missing = max(0, self.lags - history.items.shape[1])
-        items = F.pad(history.items[:, : self.lags], (0, missing), value=-1)
-        liked = self.scale_rewards(F.pad(history.rewards[:, : self.lags], (0, missing)))
+        items, rewards = history.padded(self.lags)
+        liked = self.scale_rewards(rewards)
         repeated, alike, repeated_liked, alike_liked = self.exposure
         return items, repeated + repeated_liked * liked, alike + alike_liked * liked
 

@@ -25,7 +25,9 @@ EFFECTS: Final = (
 """In the order in which they are added to the model."""
 _ITERATIONS: Final = 100
 _HISTORY: Final = 10
-"""Steps that L-BFGS remembers."""
+"""Steps that L-BFGS remembers, …"""
+_REMEMBERED: Final = 3 * 2**23
+"""… in at most so many numbers, or 2 steps; twice, for the changes of the gradient."""
 _TOLERANCE: Final = 1e-6
 """Relative decrease of the objective in an iteration at which a fit ends."""
 _ARMIJO, _SHORTEST = 1e-4, 1e-4
@@ -254,7 +256,8 @@ def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
         return value.item(), gradient
 
     at, (value, gradient) = start, evaluate(start)
-    history: deque[tuple[Tensor, Tensor]] = deque(maxlen=_HISTORY)
+    steps = max(2, min(_HISTORY, _REMEMBERED // len(start)))
+    history: deque[tuple[Tensor, Tensor]] = deque(maxlen=steps)
     for _ in range(_ITERATIONS):
         direction = -_newton(gradient, history)
         slope, length = float(gradient @ direction), 1.0

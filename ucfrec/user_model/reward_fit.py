@@ -6,6 +6,7 @@ log has all propensities, rows of new users are weighted, as policies that knew 
 shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ import torch
 
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.processes import progress
@@ -107,6 +109,8 @@ def fit_item_reward_model(
         search.sessions = model, rows.history, held_out.history
     elif begin.effects:
         search = EffectSearch(_select_some(design, seed), search.held_out, begin)
+    none = rows.rewards.new_zeros(0)  # the design has what it needs of states and history
+    rows = replace(rows, states=none, history=Shown(none, none))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         lasting = EffectSearch(design, None, begin) if search.of_new_users else search
         for name in EFFECTS:
@@ -219,17 +223,18 @@ def set_statistics(
     model.binary.fill_(binary)
     model.reward_low.fill_(values[0] if binary else states.reward_low)
     model.reward_high.fill_(values[1] if binary else states.reward_high)
-    rewards, states_before = rows.rewards.double(), rows.states.double()
+    rewards = rows.rewards.double()
     model.reward_mean.copy_(rewards.mean())
     model.reward_std.copy_(rewards.std(correction=0))
-    model.state_mean.copy_(states_before.mean(0))
-    spread = states_before.std(0, correction=0)
-    constant = spread <= _CONSTANT * states_before.mean(0).abs().clamp(min=1.0)
+    exact = rows.states.double()
+    mean, spread = exact.mean(0), exact.std(0, correction=0)
+    model.state_mean.copy_(mean)
+    constant = spread <= _CONSTANT * mean.abs().clamp(min=1.0)
     model.state_std.copy_(torch.where(constant, torch.inf, spread))
     mean = states.embeddings[rows.items].double().mean(0)
-    centred = states.embeddings.double() - mean
-    length = centred[rows.items].square().sum(1).mean().sqrt()
-    model.vectors.copy_(centred / length.clamp(min=_CONSTANT))
+    exact = states.embeddings.double().sub_(mean)
+    length = exact[rows.items].square_().sum(1).mean().sqrt()
+    model.vectors.copy_(exact.div_(length.clamp(min=_CONSTANT)))
     model.likeness.start_from(states)
 
 

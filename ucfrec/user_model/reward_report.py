@@ -18,7 +18,7 @@ from ucfrec.user_model.reward import ItemRewardModel
 
 _BINS: Final = 10
 _CHUNK: Final = 16_384
-_READ_AT_ONCE: Final = 65_536
+_READ_AT_ONCE: Final = 16_384
 _LARGEST_WEIGHT: Final = 10.0
 """Larger weights are cut off, so that no single row decides."""
 _FEWEST: Final = 50
@@ -60,17 +60,13 @@ class RewardRows:
         for start in range(0, len(steps), _READ_AT_ONCE):
             part = slice(start, start + _READ_AT_ONCE)
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
-        earlier = steps[:, None] - np.arange(1, lags + 1)
-        places = episodes[:, None], np.maximum(earlier, 0)
-        items = np.where(earlier < 0, -1, view.step_values(schema.ITEM, *places)).astype(np.int64)
-        rewards = np.where(earlier < 0, np.float32(0), view.step_values(schema.REWARD, *places))
         users = np.full(view.n_episodes, -1)
         if view.has_users:
             users = view.episode_values(schema.USER).astype(np.int64)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
-            Shown(torch.from_numpy(items), torch.from_numpy(rewards)),
+            Shown.before(view, episodes, steps, lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,

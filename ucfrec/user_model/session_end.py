@@ -206,7 +206,7 @@ class SessionEnd:
         """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
         each of some rewards (B, C)."""
         batch, count = items.shape
-        lately = _pad(history.items)
+        lately, _ = history.padded(_LAGS)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
         alike = self._likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
         repeated, number = history.items.unsqueeze(2) == items.unsqueeze(1), steps.unsqueeze(1)
@@ -258,15 +258,11 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     return {"highest": highest, "mean": mean, "scale": scale, "weights": slopes, "bias": bias}
 
 
-def _pad(items: Tensor) -> Tensor:
-    return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
-
-
 def describe_steps(
     likeness: Likeness, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
 ) -> Tensor:
     """(M, F) inputs of steps at which items (M,) were shown, after what was shown before."""
-    alike = compare_to_history(likeness, _pad(history.items), items)
+    alike = compare_to_history(likeness, history.padded(_LAGS).items, items)
     repeated = history.items == items.unsqueeze(1)
     columns = _columns(alike, repeated, torch.from_numpy(rewards), torch.from_numpy(steps))
     return torch.stack(columns, -1)

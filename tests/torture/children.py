@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 TIMEOUT = 300.0
@@ -139,12 +140,14 @@ def traced(
 ) -> Callable[[], int]:
     """The work, in a fork that kills itself `at` a call after a step.
 
-    A step opens a file in `place` to write it, makes a folder there or renames something. If all
-    ends well, `answer` lists the path of each step and the number of calls until the next.
+    A step opens a file in `place` to write it, makes a folder there or renames something, or opens
+    Parquet. If all ends well, `answer` lists the steps and the number of calls until the next.
     """
     steps: list[tuple[str, int]] = []
 
-    def count(*_: object) -> None:
+    def count(frame: FrameType, event: str, _: object) -> None:
+        if event == "return" and frame.f_code.co_qualname == "ParquetWriter.__init__":
+            steps.append(("open", 0))
         path, calls = steps[-1]
         steps[-1] = path, calls + 1
         if (len(steps) - 1, calls + 1) == at:

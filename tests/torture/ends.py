@@ -45,14 +45,13 @@ class Ends:
             if end.status:
                 raise SystemExit(f"{job.name}: {end.printed}")
             seconds = seconds if number == 2 else end.seconds
-        steps = [*enumerate(json.loads(answer.read_text()))]
-        # What a search does not finish, it starts anew. Libraries open files unseen, once the last
-        # lock is held.
-        others = ("os.rename", f"os.mkdir {place}/promotable")
-        opened = [step for step in steps if step[1][1] and not step[1][0].startswith(others)]
-        opened = [step for step in opened if "/trial-" not in step[1][0]]
-        aimed = [step for step in opened if not step[1][0].endswith(LOCK)] or opened[-1:]
-        aims = [(number, calls) for number, (_, calls) in aimed]
+        # What a search does not finish, it starts anew.
+        others = ("os.rename", "/trial-", "/promotable", LOCK)
+        aims = [
+            (number, calls)
+            for number, (step, calls) in enumerate(json.loads(answer.read_text()))
+            if calls and not any(word in step for word in others)
+        ]
         return cls(inputs, job, folder, digest_output(place / job.out), seconds, aims)
 
     def kills(self, cases: int, seed: int) -> Counter[str]:
@@ -63,7 +62,8 @@ class Ends:
             work = self.inputs.work(self.job, out)
             if number % 3 < 2:
                 step, calls = generator.choice(self.aims)
-                at = step, generator.randint(1, min(calls, generator.choice((8, calls))))
+                # A file is not whole for some calls after it is opened.
+                at = step, generator.randint(1, min(calls, generator.choice((4, calls))))
                 end = Running(traced(work, out.parent, self.folder / "steps.json", at)).wait()
             else:
                 end = self._signal(generator, out, signal.SIGKILL)

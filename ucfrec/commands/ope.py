@@ -353,6 +353,6 @@ def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
     first = f"; {rows[0].method} has {rates[0]:.3f}" if best else ""
     return (
         f"\n{rows[best].method} has the highest hit rate on liked items ({rates[best]:.3f} with "
-        f"{rows[best].conditions['k']} items){first}. Logged clicks favour what was shown:\n"
-        f"next: ucfrec ope {run}, the return per session that it would bring"
+        f"{rows[best].conditions['k']} items){first}. Logged clicks favour items that were shown.\n"
+        f"next: ucfrec ope {run}, which estimates the return of a session under its policy"
     )

@@ -68,7 +68,7 @@ class Ends:
             else:
                 end = self._signal(generator, out, signal.SIGKILL)
             counts["killed"] += end.status == -signal.SIGKILL
-            there = out.is_file() or (out.is_dir() and any(out.iterdir()))
+            there = out.is_file() or any(out.glob("[!.]*"))
             if there:
                 # A training that is resumed has a part of its files, each of them whole.
                 self._compare(counts, out, "killed: ", self.job.second == "resumes")

@@ -23,8 +23,8 @@ test-slow: .venv/dev  ## The slow tests: trainings and simulations that take man
 
 # SCALE is a share of the cases.
 SCALE ?= 1
-torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands; print a table.
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE)
+torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands, or (MUTANTS=1) broken ones.
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE) $(if $(MUTANTS),--mutants)
 
 lint: .venv/dev  ## Style.
 	$(BIN)/ruff check .

@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Callable
+from itertools import permutations
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 import pandas as pd
@@ -64,11 +66,39 @@ def test_gauc_is_the_weighted_mean_of_auc_over_users() -> None:
         assert metrics.gauc(rows.astype({"liked": kind})) == pytest.approx(expected)
 
 
-def test_ids_may_be_text() -> None:
-    text = [each.astype(str) for each in (RECOMMENDED[["user_id", "item_id"]], RELEVANT)]
-    recommended = text[0].assign(rank=RECOMMENDED["rank"])
-    expected = FIXTURE["values"]["5"]["recall"]
-    assert metrics.recall(recommended, text[1], 5) == pytest.approx(expected)
+KINDS: dict[str, Callable[[Any], Any]] = {
+    "text": str,
+    "bytes": lambda number: bytes([number % 256, number // 256]),
+    "UUID": lambda number: UUID(int=number),
+}
+UNUSED = pd.CategoricalDtype([*range(-3, 200)])
+
+
+def converted(frame: pd.DataFrame, convert: Callable[[Any], Any]) -> pd.DataFrame:
+    pairs = {name: [*map(convert, frame[name])] for name in ("user_id", "item_id")}
+    return frame.assign(**pairs)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "category"])
+def test_ids_may_be_of_any_kind_but_only_of_one(kind: str) -> None:
+    of_category = {"user_id": UNUSED, "item_id": UNUSED}
+    frames = [
+        frame.astype(of_category) if kind == "category" else converted(frame, KINDS[kind])
+        for frame in (RECOMMENDED, RELEVANT)
+    ]
+    for name in ("recall", "ndcg", "mean_average_precision"):
+        expected = FIXTURE["values"]["5"][name]
+        assert getattr(metrics, name)(*frames, 5) == pytest.approx(expected)
+    if kind in ("bytes", "UUID"):
+        with pytest.raises(InputError, match=f"holds {kind}.* in recommended, but text in relev"):
+            metrics.recall(frames[0], converted(RELEVANT, str), 5)
+
+
+@pytest.mark.parametrize("order", [*permutations(range(3))])
+def test_an_item_that_is_recommended_twice_counts_at_its_best_rank(order: tuple[int, ...]) -> None:
+    twice = pd.DataFrame({"user_id": 1, "item_id": ["A", "B", "A"], "rank": [1, 2, 3]})
+    liked = pd.DataFrame({"user_id": [1], "item_id": ["A"]})
+    assert metrics.mrr(twice.iloc[[*order]], liked, 3) == 1.0
 
 
 def with_text(frame: pd.DataFrame, column: str = "item_id") -> pd.DataFrame:

@@ -2,10 +2,10 @@
 
 import contextlib
 import importlib
+import json
 import os
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -13,8 +13,8 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from tests.support.signals import wait_until_handled
+from types import FrameType
+from typing import Any
 
 TIMEOUT = 300.0
 """Seconds after which a command counts as hung."""
@@ -115,47 +115,63 @@ def command(*arguments: object) -> Callable[[], int]:
     return work
 
 
-def run(*arguments: object) -> End:
-    """One command from its beginning to its end."""
-    return Running(command(*arguments)).wait()
-
-
-def run_first(*arguments: object) -> End:
-    """`run`, after which this interpreter imports what the command imported.
+def run_first(work: Callable[[], int]) -> End:
+    """Run in a fork, after which this interpreter imports what the fork imported.
 
     Forks then spend their time on what the command does, not on its imports.
     """
     with tempfile.NamedTemporaryFile("r") as names:
 
-        def work() -> int:
+        def listed() -> int:
             try:
-                return command(*arguments)()
+                return work()
             finally:
                 Path(names.name).write_text("\n".join(sys.modules))
 
-        end = Running(work).wait()
+        end = Running(listed).wait()
         for name in names.read().splitlines():
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
     return end
 
 
-def run_fresh(*arguments: object, number: int, moment: float) -> End:
-    """One command in a new interpreter, which gets the signal `number` after `moment` seconds."""
-    words, start = [sys.executable, "-m", "ucfrec", *map(str, arguments)], time.monotonic()
-    to = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    started = subprocess.Popen(words, text=True, **to)
-    if number != signal.SIGKILL:
-        # Before that, Python's own handlers answer. TERM has a handler first of all in ucfrec.
-        wait_until_handled(started.pid, signal.SIGTERM)
-    time.sleep(moment)
-    started.send_signal(number)
-    try:
-        _, printed = started.communicate(timeout=TIMEOUT)
-    except subprocess.TimeoutExpired:
-        started.kill()
-        return End(1, "", time.monotonic() - start, hung=True)
-    return End(started.returncode, printed, time.monotonic() - start)
+def traced(
+    work: Callable[[], int], place: Path, answer: Path, at: tuple[int, int] = (-1, -1)
+) -> Callable[[], int]:
+    """The work, in a fork that kills itself `at` a call after a step.
+
+    A step opens a file in `place` to write it, makes a folder there or renames something, or opens
+    Parquet. If all ends well, `answer` lists the steps and the number of calls until the next.
+    """
+    steps: list[tuple[str, int]] = []
+
+    def count(frame: FrameType, event: str, _: object) -> None:
+        if event == "return" and frame.f_code.co_qualname == "ParquetWriter.__init__":
+            steps.append(("open", 0))
+        path, calls = steps[-1]
+        steps[-1] = path, calls + 1
+        if (len(steps) - 1, calls + 1) == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def see(event: str, values: Sequence[Any]) -> None:
+        steps_here = {
+            "open": lambda: values[2] & (os.O_WRONLY | os.O_RDWR),
+            "os.mkdir": lambda: not os.path.isdir(values[0]),
+            "os.rename": lambda: True,
+        }
+        if event in steps_here and f"{place}/" in str(values[0]) and steps_here[event]():
+            steps.append((f"{event} {values[0]}", 0))
+            sys.setprofile(count)
+
+    def traced_work() -> int:
+        sys.addaudithook(see)
+        try:
+            return work()
+        finally:
+            sys.setprofile(None)
+            answer.write_text(json.dumps(steps))
+
+    return traced_work
 
 
 def leftovers(*folders: Path) -> list[str]:

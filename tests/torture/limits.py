@@ -1,134 +1,91 @@
 """What the operating system refuses, and Parquet files that are more than they seem."""
 
 import ctypes
-import os
 import resource
 import shutil
 import signal
 import subprocess
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.torture.children import Running, command, leftovers
 from tests.torture.inputs import Inputs, Job
 
+_SKIPPED = 75
+"""Status where this system cannot do what a case needs."""
 _BY_A_LIBRARY = (127, -signal.SIGABRT, -signal.SIGSEGV)
 """How libraries in C++ and the C library end a process that gets no memory, without asking us."""
 
 
-def limits(inputs: Inputs, folder: Path) -> Counter[str]:
-    """Every command on a read-only and a full disk, without rights, room or memory."""
+def limits(inputs: Inputs, job: Job, folder: Path) -> Counter[str]:
+    """The command on a read-only and a full disk, without room or memory, and without its input."""
     counts, place = Counter[str](), folder / "limits"
-    place.mkdir()
+    (place / "there").mkdir(parents=True)
     (place / "file").write_text("")
-    for job in inputs.jobs():
-        taken = "folder for a file" if job.suffix else "exists"
-        outs = {"path through a file": place / "file" / "out", taken: place}
-        for name, out in (outs | {"name too long": place / ("n" * 254)}).items():
-            _expect(counts, job, name, Running(command(*job.arguments(out))))
-        out = place / f"small-{job.name}{job.suffix}"
-        _expect(counts, job, "file too large", Running(_limited(job, out)))
-        for megabytes in (60, 200, 1000):
-            out = place / f"memory-{job.name}-{megabytes}{job.suffix}"
-            started = Running(command(*job.arguments(out)), memory=megabytes * 2**20)
-            _expect(counts, job, f"{megabytes} MB of memory", started, (0, 2, *_BY_A_LIBRARY))
-        closed = place / "closed"
-        closed.mkdir(mode=0o500, exist_ok=True)
-        out = closed / f"out{job.suffix}"
-        _expect(counts, job, "no permission", Running(_without_rights(job, out)))
-        for name, options in (("read-only disk", "ro"), ("full disk", "size=8k")):
-            _expect(counts, job, name, Running(_mounted(job, place / "disk", options)), (0, 2, 75))
-    _vanishing(counts, inputs, place)
+
+    def expect(name: str, started: Running, *allowed: int) -> None:
+        end = started.wait()
+        counts["skipped" if end.status == _SKIPPED else "cases"] += 1
+        if fault := end.fault((*allowed, 2, _SKIPPED)):
+            counts[f"{name}: {fault}"] += 1
+        counts["refused"] += end.status == 2
+        counts["ended by a library"] += end.status in _BY_A_LIBRARY
+
+    work = partial(inputs.work, job)
+    # A search and a server take a folder that is there; `promote` names its file itself.
+    wrong = [place / "file" / "out", place / ("n" * 254), place / "there"]
+    wrong = wrong[: {"tune": 2, "serve": 1, "promote": 0}.get(job.name, 3)]
+    for out in wrong:
+        expect(f"out is {out.name[:20]}", Running(work(out)))
+    expect("file too large", Running(_with_small_files(work(place / "small" / job.out))), 0)
+    for megabytes in (60, 200, 1000):
+        started = Running(work(place / "memory" / job.out), memory=megabytes * 2**20)
+        expect(f"{megabytes} MB of memory", started, 0, *_BY_A_LIBRARY)
+    for name, options in (("read-only disk", "ro"), ("full disk", "size=8k")):
+        expect(name, Running(_mounted(inputs, job, place / "disk", options)), 0)
+    words = [str(part) for part in job.arguments(place / "vanished" / job.out)]
+    for name in ("store", "run", "logs"):
+        copy, source = place / "copy" / name, f"{inputs.folder}/{name}"
+        if (moved := [part.replace(source, str(copy)) for part in words]) != words:
+            shutil.copytree(inputs.folder / name, copy)
+            # A server that finds all it needs would answer for ever.
+            started = Running(command(*moved))
+            shutil.rmtree(copy)
+            started.send(signal.SIGTERM) if job.name == "serve" else None
+            expect(f"{name} vanishes", started, 0, 143, -signal.SIGTERM)
     for path in leftovers(place):
         counts[f"left: {path}"] += 1
     shutil.rmtree(place, ignore_errors=True)
     return counts
 
 
-def _expect(
-    counts: Counter[str], job: Job, name: str, started: Running, allowed: tuple[int, ...] = (2,)
-) -> None:
-    end = started.wait()
-    counts["cases"] += 1
-    if end.status == 75:
-        counts["skipped"] += 1
-        return
-    if fault := end.fault(allowed):
-        counts[f"{job.name}, {name}: {fault}"] += 1
-    counts["refused"] += end.status == 2
-    counts["ended by a library"] += end.status in _BY_A_LIBRARY
+def _with_small_files(work: Callable[[], int]) -> Callable[[], int]:
+    """The work where no file may have more than 1,000 bytes."""
+
+    def limited() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        return work()
+
+    return limited
 
 
-def _limited(job: Job, out: Path) -> Callable[[], int]:
-    """The command where no file may have more than one byte."""
-
-    def work() -> int:
-        log, limit = os.dup(2), resource.RLIMIT_FSIZE
-        # The log of stderr would be too large as well.
-        reader, writer = os.pipe()
-        os.dup2(writer, 2)
-        most = resource.getrlimit(limit)[1]
-        resource.setrlimit(limit, (1, most))
-        try:
-            return command(*job.arguments(out))()
-        finally:
-            resource.setrlimit(limit, (most, most))
-            os.dup2(log, 2)
-            os.close(writer)
-            os.write(2, os.read(reader, 60_000))
-
-    return work
-
-
-def _without_rights(job: Job, out: Path) -> Callable[[], int]:
-    """The command without the capabilities by which root may do what permissions forbid."""
-
-    def work() -> int:
-        header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # version 3 of the interface, this process
-        none = (ctypes.c_uint32 * 6)()
-        if ctypes.CDLL(None).capset(header, none) or os.access(out.parent, os.W_OK):
-            return 75
-        return command(*job.arguments(out))()
-
-    return work
-
-
-def _mounted(job: Job, disk: Path, options: str) -> Callable[[], int]:
+def _mounted(inputs: Inputs, job: Job, disk: Path, options: str) -> Callable[[], int]:
     """The command on a disk of its own, which only its process sees."""
 
     def work() -> int:
         disk.mkdir(exist_ok=True)
         if ctypes.CDLL(None).unshare(0x00020000):  # CLONE_NEWNS; Python has it from 3.12 on
-            return 75
+            return _SKIPPED
         quiet: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
         for arguments in (["--make-rprivate", "/"], ["-t", "tmpfs", "-o", options, "tmpfs", disk]):
             if subprocess.run(["mount", *arguments], check=False, **quiet).returncode:
-                return 75
-        return command(*job.arguments(disk / f"out{job.suffix}"))()
+                return _SKIPPED
+        return inputs.work(job, disk / job.out)()
 
     return work
-
-
-def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
-    """Inputs that are removed before or while a command reads them."""
-    for job in inputs.jobs():
-        if job.name in ("collect", "evaluate"):
-            continue
-        for name in ("store", "run", "logs"):
-            copy = place / "copy"
-            shutil.rmtree(copy, ignore_errors=True)
-            copy.mkdir()
-            own = [str(part) for part in job.arguments(place / f"vanished-{job.name}{job.suffix}")]
-            source = f"{inputs.folder}/{name}"
-            moved = [part.replace(source, f"{copy}/{name}") for part in own]
-            if moved == own:
-                continue
-            shutil.copytree(inputs.folder / name, copy / name)
-            started = Running(command(*moved))
-            shutil.rmtree(copy)
-            _expect(counts, job, f"{name} vanishes", started, (0, 2))
 
 
 def hostile_parquet(folder: Path) -> Counter[str]:

@@ -6,8 +6,10 @@ every change. The first mutant is no file of any kind; a reader that does not re
 another file.
 """
 
+import errno
 import json
 import os
+import pickle
 import random
 import resource
 import shutil
@@ -53,41 +55,40 @@ class Reader:
     read: Callable[[Path], object]
     """Reads the folder."""
     slow: bool = False
+    named: str = ""
+    """How messages name the file, if not by its name."""
+
+    def fuzz(self, folder: Path, cases: int, seed: int) -> Counter[str]:
+        """Read the file, one that is none, and `cases` mutated ones."""
+        return _run_batches(partial(_fuzz_batch, self, folder / "fuzz", seed), folder, cases)
+
+    def flip(self, folder: Path, cases: int, seed: int) -> Counter[str]:
+        """Flip single bits of all files of the folder, and read everything of it."""
+        return _run_batches(partial(_flip_batch, self, folder / "flips", seed), folder, cases)
 
 
 class HungError(Exception):
     """A reader took too long."""
 
 
-def share_cases(cases: int, readers: list[Reader]) -> dict[str, int]:
-    """Number of cases of each reader; slow ones have a tenth of the others' share."""
-    weights = {reader.name: 1 if reader.slow else 10 for reader in readers}
-    return {name: -(-cases * weight // sum(weights.values())) for name, weight in weights.items()}
-
-
-def run_batches(work: Callable[[range, Path], int], folder: Path, cases: int) -> Counter[str]:
-    """The counts that `work` writes as JSON for so many cases, in processes of their own."""
+def _run_batches(work: Callable[[range], Counter[str]], folder: Path, cases: int) -> Counter[str]:
+    """The counts of `work` for so many cases, in processes of their own."""
     counts, answer = Counter[str](), folder / "counts.json"
     for begin in range(0, cases, BATCH):
+
+        def count(numbers: range) -> int:
+            answer.write_text(json.dumps(work(numbers)))
+            return 0
+
         answer.unlink(missing_ok=True)
-        numbers = range(begin, min(begin + BATCH, cases))
-        end = Running(partial(work, numbers, answer)).wait(SECONDS * 60)
+        batch = partial(count, range(begin, min(begin + BATCH, cases)))
+        end = Running(batch).wait(SECONDS * 60)
         if answer.exists():
             counts.update(json.loads(answer.read_text()))
         if end.status:
             last = end.printed.strip().splitlines()[-1:] or [""]
             counts[f"a process ended with {end.status}: {last[0][:150]}"] += 1
     return counts
-
-
-def fuzz(reader: Reader, folder: Path, cases: int, seed: int) -> Counter[str]:
-    """Give one reader the file, one that is none, and `cases` mutated ones."""
-    return run_batches(partial(_fuzz_batch, reader, folder / "fuzz", seed), folder, cases)
-
-
-def flip_bits(reader: Reader, folder: Path, cases: int, seed: int) -> Counter[str]:
-    """Flip single bits of all files of the reader's folder, and read everything of it."""
-    return run_batches(partial(_flip_batch, reader, folder / "flips", seed), folder, cases)
 
 
 def _copy_folder(reader: Reader, place: Path) -> None:
@@ -99,82 +100,68 @@ def _copy_folder(reader: Reader, place: Path) -> None:
     shutil.copytree(reader.folder, place, copy_function=os.link)
 
 
-def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
+def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range) -> Counter[str]:
     _copy_folder(reader, place)
     path, content = place / reader.file, (reader.folder / reader.file).read_bytes()
     counts = Counter[str]()
-    if (outcome := _read(reader, place, Counter[str]())) != "harmless":
+    if (outcome := _read(reader, place)[0]) != "harmless":
         counts[f"the file as it was written is {outcome}"] += 1
-    _write_file(path, b"\xff[{\n\x00")
+    _write_file(path, b"\xff[{\n\x00".ljust(len(content), b"\x00"))
     _reseal(place, reader.file)
-    if (outcome := _read(reader, place, Counter[str]())) != "found":
-        counts[f"no file of any kind is {outcome}"] += 1
+    outcome, said = _read(reader, place)
+    if outcome != "found" or (reader.named or path.name) not in said:
+        counts[f"no file of any kind is {outcome}: {said!s:.80}"] += 1
     for number in numbers:
         generator = random.Random(f"{seed} {reader.name} {number}")
         _write_file(path, _mutate(generator, content, path, number))
         _reseal(place, reader.file)
-        counts[_read(reader, place, counts)] += 1
-    answer.write_text(json.dumps(counts))
-    return 0
+        counts[_read(reader, place)[0]] += 1
+    return counts
 
 
 def _raise_hung(*_: object) -> None:
     raise HungError
 
 
-def _read(reader: Reader, place: Path, counts: Counter[str], expected: Any = None) -> str:
-    """What came of reading: "found", "harmless" or a fault."""
+def _read(reader: Reader, place: Path) -> tuple[str, Any]:
+    """What came of reading: "found" with the message, "harmless" with the content, or a fault."""
     from ucfrec.errors import InputError
 
     signal.alarm(SECONDS)
     try:
-        content = reader.read(place)
+        return "harmless", reader.read(place)
     except InputError as error:
-        if not str(error).isprintable():
-            counts["not one printable line"] += 1
-        return "found"
+        return "found" if str(error).isprintable() else "not one printable line", str(error)
     except HungError:
-        return "hung"
+        return "hung", None
     except Exception as error:
-        return f"{type(error).__name__} {_find_place(error)}: {str(error)[:80]}"
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            return "found", str(error)  # a name that the file gives; commands explain it
+        frames = traceback.extract_tb(error.__traceback__)
+        ours = [f"{Path(f.filename).name}:{f.lineno}" for f in frames if "ucfrec" in f.filename]
+        return f"{type(error).__name__} {(ours or [''])[-1]}: {error!s:.80}", None
     finally:
         signal.alarm(0)
-    same = expected is None or _are_equal(content, expected)
-    return "harmless" if same else "silently another content"
 
 
-def _find_place(error: BaseException) -> str:
-    """The last place in ucfrec that the error passed."""
-    frames = traceback.extract_tb(error.__traceback__)
-    ours = [f"{Path(f.filename).name}:{f.lineno}" for f in frames if "ucfrec" in f.filename]
-    return ours[-1] if ours else ""
-
-
-def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
-    expected, counts = reader.read(reader.folder), Counter[str]()
+def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range) -> Counter[str]:
+    expected, counts = pickle.dumps(reader.read(reader.folder)), Counter[str]()
     _copy_folder(reader, place)
     files = sorted(path for path in place.rglob("*") if path.is_file() and path.stat().st_size)
     for number in numbers:
         generator = random.Random(f"{seed} {reader.name} {number}")
         path = generator.choice(files)
-        content = path.read_bytes()
-        flipped = bytearray(content)
+        written = path.read_bytes()
+        flipped = bytearray(written)
         flipped[generator.randrange(len(flipped))] ^= 1 << generator.randrange(8)
         _write_file(path, bytes(flipped))
-        outcome = _read(reader, place, counts, expected)
+        outcome, content = _read(reader, place)
+        if outcome == "harmless" and pickle.dumps(content) != expected:
+            outcome = "silently another content"
         fault = f"{path.relative_to(place).as_posix()}: {outcome}"
         counts[outcome if outcome in ("found", "harmless") else fault] += 1
-        _write_file(path, content)
-    answer.write_text(json.dumps(counts))
-    return 0
-
-
-def _are_equal(first: Any, second: Any) -> bool:
-    if isinstance(first, list):
-        return len(first) == len(second) and all(map(_are_equal, first, second))
-    if isinstance(first, np.ndarray):
-        return first.dtype == second.dtype and first.tobytes() == second.tobytes()
-    return bool(first == second)
+        _write_file(path, written)
+    return counts
 
 
 def _write_file(path: Path, content: bytes) -> None:
@@ -245,26 +232,19 @@ def _mutate_tensors(generator: random.Random, content: bytes, path: Path) -> byt
     tensors, metadata = load_tensors(copy)
     for _ in range(generator.choice((1, 1, 2, 4))):
         name = generator.choice([*tensors] or ["new"])
-        tensor = tensors.pop(name, torch.zeros(3))
-        match generator.randrange(7):
-            case 0:
-                continue
-            case 1:
-                tensors[name + "s"] = tensor
-            case 2:
-                tensor = tensor.to(getattr(torch, generator.choice(DTYPES)))
-            case 3:
-                tensor = tensor.reshape(-1)
-            case 4:
-                tensor = tensor[: len(tensor) // 2] if tensor.dim() else tensor.unsqueeze(0)
-            case 5:
-                number = generator.choice((-1, 0, 100, float("nan"), float("inf")))
-                if tensor.is_floating_point() or isinstance(number, int):
-                    boolean = tensor.dtype == torch.bool
-                    tensor = torch.full_like(tensor, number != 0 if boolean else number)
-            case 6:
-                tensor = torch.zeros(generator.choice(SHAPES), dtype=tensor.dtype)
-        tensors[name] = tensor.clone()
+        was, shape = tensors.pop(name, torch.zeros(3)), generator.choice(SHAPES)
+        number = generator.choice((-1, 0, 100, float("nan"), float("inf")))
+        changes: tuple[dict[str, Any], ...] = (
+            {},
+            {name: was, f"{name}s": was.clone()},
+            {name: was.to(getattr(torch, generator.choice(DTYPES)))},
+            {name: was.reshape(-1)},
+            {name: was[: len(was) // 2] if was.dim() else was.unsqueeze(0)},
+            {name: (was * 0 + number).to(was.dtype)},
+            {name: torch.zeros(shape, dtype=was.dtype)},
+        )
+        tensors |= generator.choice(changes)
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     if generator.random() < 0.4:
         changed = json.loads(_mutate_json(generator, json.dumps(metadata).encode()))
         metadata = changed if isinstance(changed, dict) else {"changed": changed}
@@ -280,18 +260,9 @@ def _mutate_bytes(generator: random.Random, content: bytes) -> bytes:
         at = generator.randrange(len(changed) + 1)
         if generator.random() < 0.5:
             at = min(at, generator.randrange(256))  # headers lie at the beginning
-        word = generator.choice(WORDS)
-        match generator.randrange(5):
-            case 0:
-                changed[at : at + 1] = bytes([generator.randrange(256)])
-            case 1:
-                changed[at:at] = word
-            case 2:
-                del changed[at : at + generator.choice((1, 4, 100))]
-            case 3:
-                del changed[at:]
-            case 4:
-                changed[at : at + len(word)] = word
+        word = generator.choice((*WORDS, bytes([generator.randrange(256)]), b""))
+        removed = generator.choice((0, 1, 4, 100, len(word), len(changed)))
+        changed[at : at + removed] = word
     return bytes(changed)
 
 
@@ -331,7 +302,7 @@ def list_readers(inputs: Inputs) -> list[Reader]:
     of_run += ("training_counts.safetensors", "training_returns.safetensors")
     return [
         *(Reader(file, store, file, read_store) for file in of_store),
-        *(Reader(f"run: {file}", run, file, act, slow=True) for file in of_run),
+        *(Reader(f"run: {file}", run, file, read_run, slow=True) for file in of_run),
         Reader("report: run.json", run, "run.json", report, slow=True),
         Reader("report: samples.json", run, "samples.json", report, slow=True),
         lone(run, "policy/last.safetensors", load_tensors),
@@ -342,7 +313,7 @@ def list_readers(inputs: Inputs) -> list[Reader]:
         replace(lone(texts, "evaluations.json", report_results, True), name="report: evaluations"),
         lone(texts, "mapping.toml", read_mapping),
         lone(texts, "config.toml", lambda file: resolve_config(file=file)),
-        lone(texts, "setting.txt", read_setting),
+        replace(lone(texts, "setting.txt", read_setting), named="--set"),
         lone(texts, "log.csv", read_log, slow=True),
         lone(texts, "log.parquet", read_log, slow=True),
         lone(texts, "hopper.hdf5", read_d4rl),
@@ -368,24 +339,17 @@ def read_store(path: Path) -> list[Any]:
 
 
 def read_run(path: Path) -> list[Any]:
-    """All that ucfrec reads of a run."""
+    """All that ucfrec reads of a run, and how its policy acts."""
     from ucfrec.fitting.checkpoint import read_metrics
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     parts: list[Any] = []
-    for checkpoint in ("best", "last"):
+    for checkpoint in ("last", "best"):
         trained = TrainedPolicy.load(path, checkpoint)
         parts += [tensor.numpy() for tensor in trained.policy.state_dict().values()]
         parts += [trained.item_ids, trained.user_ids]
+    observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
+    parts.append(trained.actor(2).act(observations, np.array([True, False])))
     used = ("config", "sizes", "return_quantiles", "reward", "fingerprint", "train_steps")
     parts.append(repr({name: getattr(trained.record, name) for name in used}))
     return [*parts, repr(read_metrics(path / "policy"))]
-
-
-def act(path: Path) -> object:
-    """Load the policy of a run, and let it act."""
-    from ucfrec.runs.trained_policy import TrainedPolicy
-
-    trained = TrainedPolicy.load(path)
-    observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
-    return trained.actor(2).act(observations, np.array([True, False]))

@@ -170,7 +170,9 @@ _NO_MEMORY: Final = (
     "could not create a primitive"
 )
 """How libraries that raise other errors than `MemoryError` say that there is no memory."""
-_NO_SPACE: Final = "No space left on device|Disk quota exceeded|File too large"
+_NO_SPACE: Final = (
+    "No space left on device|Disk quota exceeded|File too large|disk is full|disk I/O error"
+)
 """How libraries that raise other errors than `OSError` say that a disk is full."""
 
 

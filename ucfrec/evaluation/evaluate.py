@@ -164,22 +164,14 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
 
     `episodes` (M,) are sorted indices, `items` (M,) the items of these steps; M is at least 1.
     """
-    starts = np.unique(episodes, return_index=True)[1]
-    lengths = np.diff(starts, append=len(episodes))
-    # Pairs of all episodes are enumerated at once: each step with all later ones of its episode.
-    places = np.arange(len(items))
-    later = np.repeat(starts + lengths, lengths) - places - 1
-    first = np.repeat(places, later)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    earlier_item, later_item = items[first], items[second]
-    shared = (incidence[earlier_item] & incidence[later_item]).sum(axis=1)
-    either = (incidence[earlier_item] | incidence[later_item]).sum(axis=1)
-    distances = 1.0 - shared / np.maximum(either, 1)
-    distances[earlier_item == later_item] = 0.0
-    owner = np.searchsorted(starts, first, side="right") - 1
-    total = np.bincount(owner, weights=distances, minlength=len(starts))
-    pairs = lengths * (lengths - 1) / 2
-    return float(np.where(lengths > 1, total / np.maximum(pairs, 1), 1.0).mean())
+    starts, means = np.unique(episodes, return_index=True)[1], []
+    for listed in np.split(items, starts[1:]):
+        first, second = (listed[places] for places in np.triu_indices(len(listed), 1))
+        shared = (incidence[first] & incidence[second]).sum(axis=1)
+        either = (incidence[first] | incidence[second]).sum(axis=1)
+        distances = np.where(first == second, 0.0, 1 - shared / np.maximum(either, 1))
+        means.append(distances.mean() if len(distances) else 1.0)
+    return float(np.mean(means))
 
 
 def dominant_tags(incidence: BoolArray, positives: IntArray) -> BoolArray:

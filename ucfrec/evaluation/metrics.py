@@ -2,9 +2,10 @@
 
 `recommended` has one row per item and user: `user_id`, `item_id` and `rank` (from 1), as
 `Recommender.recommend` returns it. `relevant` has the pairs `user_id`, `item_id` of what users
-liked later; a pair counts once. The definitions are those of RecTools where it has the metric.
-Means are over the users of `relevant` (a user without recommendations counts 0), or over those of
-`recommended` where nothing relevant is asked for.
+liked later; a pair counts once, and an item that a user is recommended twice at its best rank. The
+definitions are those of RecTools where it has the metric. Means are over the users of `relevant` (a
+user without recommendations counts 0), or over those of `recommended` where nothing relevant is
+asked for.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,16 +22,17 @@ from ucfrec.settings import require_whole
 
 _RANK: Final = "rank"
 _PAIR: Final = [USER_ID, ITEM_ID]
-_KINDS: Final = {"integer": "numbers", "floating": "numbers", "string": "text"}
-"""Kinds of ids, by what pandas calls their type."""
+_NUMBERS: Final = ("integer", "floating", "mixed-integer-float", "integer-na", "decimal", "boolean")
+"""What pandas calls the types of ids that are equal where their values are."""
 
 
 def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
     """Share of users with a relevant item among the `k` best.
 
     Raises:
-        InputError: a column is missing, there are no rows, ids are numbers in one frame and text
-            in the other, or ranks of a user are not distinct whole numbers from 1; as all of these.
+        InputError: a column is missing, there are no rows, ids are of one kind (numbers, text,
+            bytes, UUIDs, …) in one frame and of another in the other, or ranks of a user are not
+            distinct whole numbers from 1; as all of these.
     """
     return float(_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].any().mean())
 
@@ -87,7 +89,7 @@ def gauc(scored: pd.DataFrame) -> float:
     Raises:
         InputError: a column or a score is missing, there are no rows, or `liked` is something else.
     """
-    _require(scored, "scored", [USER_ID, "score", "liked"])
+    scored = _require(scored, "scored", [USER_ID, "score", "liked"])
     if unusable := (~scored["liked"].isin([0, 1])).sum():
         raise InputError(
             f"scored: liked is neither true nor false in {unusable:,} rows; give true and "
@@ -95,7 +97,7 @@ def gauc(scored: pd.DataFrame) -> float:
         )
     if missing := scored["score"].isna().sum():
         raise InputError(f"scored: score is missing in {missing:,} rows; leave them out")
-    users, owner = np.unique(scored[USER_ID].to_numpy(), return_inverse=True)
+    owner, users = pd.factorize(scored[USER_ID])
     scores, liked = scored["score"].to_numpy(np.float64), scored["liked"].to_numpy(bool)
     above, below = group_auc(scores, liked, owner, len(users))
     return float(above.sum() / below.sum()) if below.any() else float("nan")
@@ -113,8 +115,7 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
     users who have the item, mean over a user's items and then over users. `history` has the pairs
     `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
     """
-    top = _top(recommended, k)
-    _require(history, "history", _PAIR)
+    top, history = _top(recommended, k), _require(history, "history", _PAIR)
     _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
     users = history.groupby(ITEM_ID)[USER_ID].nunique()
     share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
@@ -168,8 +169,8 @@ def serendipity(
     """
     top = _top(recommended, k)
     n = _count_items(catalogue, top)
-    _require(relevant, "relevant", _PAIR, top)
-    _require(history, "history", [ITEM_ID], top)
+    relevant = _require(relevant, "relevant", _PAIR, top)
+    history = _require(history, "history", [ITEM_ID], top)
     popularity = history[ITEM_ID].value_counts().rank(method="dense", ascending=False)
     by_all = ((n + 1 - top[ITEM_ID].map(popularity)) / n).fillna(0.0)
     earlier = ((n + 1 - top[_RANK]) / n - by_all).clip(lower=0.0)
@@ -180,7 +181,7 @@ def serendipity(
 
 def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
     """The rows among the `k` best of each user."""
-    _require(recommended, "recommended", [*_PAIR, _RANK])
+    recommended = _require(recommended, "recommended", [*_PAIR, _RANK])
     k, ranks = require_whole("k", k), recommended[_RANK]
     if not is_numeric_dtype(ranks) or not (ranks >= 1).all():
         lowest = ranks.min() if is_numeric_dtype(ranks) else ranks.iloc[0]
@@ -195,9 +196,9 @@ def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
 
 def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataFrame:
     """One row per relevant pair, with its `rank` if it is among the `k` best, else NaN."""
-    top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
-    _require(relevant, "relevant", _PAIR, recommended)
-    return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
+    top = _top(recommended, k).sort_values(_RANK).drop_duplicates(_PAIR)
+    pairs = _require(relevant, "relevant", _PAIR, recommended).drop_duplicates()
+    return pairs.merge(top, on=_PAIR, how="left")
 
 
 def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
@@ -217,18 +218,26 @@ def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
 
 def _require_comparable(ids: pd.Series, reference: pd.Series, of_others: str) -> None:
     """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
-    kinds = [_KINDS.get(infer_dtype(np.asarray(column)), "") for column in (ids, reference)]
-    if {*kinds} == {"numbers", "text"}:
+    own, other = _kind(ids), _kind(reference)
+    if own != other:
         raise InputError(
-            f"{ids.name} holds {kinds[0]} in recommended, but {kinds[1]} in {of_others}; convert "
-            "one of them with astype"
+            f"{ids.name} holds {own} in recommended, but {other} in {of_others}; convert one of "
+            "them with astype"
         )
+
+
+def _kind(ids: pd.Series) -> str:
+    name = infer_dtype(np.asarray(ids), skipna=True)
+    if name == "mixed":  # objects that pandas does not know
+        return f"{type(ids.iloc[0]).__name__} objects"
+    return "text" if name == "string" else "numbers" if name in _NUMBERS else name
 
 
 def _require(
     frame: pd.DataFrame, name: str, columns: Sequence[str], beside: pd.DataFrame | None = None
-) -> None:
-    """Check that a frame has rows and columns, of the kinds of those of `recommended`, if given."""
+) -> pd.DataFrame:
+    """The columns of a frame, without categories, once it has rows and is found to have columns of
+    the kinds of those of `recommended`, if given."""
     absent = [column for column in columns if column not in frame]
     if absent:
         raise InputError(f"{name} has no column {', '.join(absent)}; rename the one that it is in")
@@ -237,3 +246,6 @@ def _require(
     if beside is not None:
         for column in columns:
             _require_comparable(beside[column], frame[column], name)
+    of_category = [c for c in columns if isinstance(frame[c].dtype, pd.CategoricalDtype)]
+    # pandas 2 would count categories without rows as users and items.
+    return frame[[*columns]].astype(dict.fromkeys(of_category, object))

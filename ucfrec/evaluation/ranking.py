@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -271,49 +271,35 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
     return {name: sums[name] for name in MEASURES}
 
 
-@dataclass(frozen=True)
-class Compared:
-    """One ranker's measures, by the names in `MEASURES`."""
-
-    name: str
-    values: Mapping[str, float]
-    intervals: Mapping[str, Sequence[float]]
-    """Low and high end of the 95% interval, by a percentile bootstrap over users."""
-    differences: Mapping[str, Sequence[float]]
-    """Value minus the reference's, and the ends of its 95% interval (paired bootstrap)."""
-    coverage: float
-    """Share of the catalogue's items that are recommended at one step or more."""
-
-
 def compare(
     period: Period, ranked: Mapping[str, Ranked], reference: str, seed: int
-) -> list[Compared]:
-    """Measures of every ranker (name: results), with intervals over users and differences from
-    `reference`, by a bootstrap that draws the same users for all rankers.
+) -> dict[str, dict[str, Any]]:
+    """By ranker (name: results), the value of each measure; `intervals`, the ends of their 95%
+    intervals (percentile bootstrap over users); `differences` from `reference`, each with the ends
+    of its interval, of the same draws of users for all; and `coverage`, the share of the
+    catalogue's items that are recommended at one step or more.
     """
     measured = [[*measure(period, entry).values()] for entry in ranked.values()]
     # (U, rankers, measures), so that one draw of users serves all rankers.
     above, below = np.ascontiguousarray(np.transpose(measured, (2, 3, 0, 1)))
-    n_users, size = len(above), (-1, len(ranked), len(MEASURES))
-    ratios = resampled_ratios(above.reshape(n_users, -1), below.reshape(n_users, -1), seed)
-    resampled = ratios.reshape(size)
+    users = len(above)
+    ratios = resampled_ratios(above.reshape(users, -1), below.reshape(users, -1), seed)
+    resampled = ratios.reshape(-1, *above.shape[1:])
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
     column = list(ranked).index(reference)
     ends = _find_ends(resampled)
-    differences = np.stack(
-        [values - values[column], *_find_ends(resampled - resampled[:, column : column + 1])]
-    )
-    return [
-        Compared(
-            name,
-            dict(zip(MEASURES, values[row].tolist(), strict=True)),
-            dict(zip(MEASURES, ends[:, row].T.tolist(), strict=True)),
-            dict(zip(MEASURES, differences[:, row].T.tolist(), strict=True)),
-            len(np.setdiff1d(entry.top, [-1])) / period.n_items,
-        )
+    beyond = _find_ends(resampled - resampled[:, column : column + 1])
+    differences = np.stack([values - values[column], *beyond])
+    return {
+        name: {
+            **dict(zip(MEASURES, values[row].tolist(), strict=True)),
+            "coverage": len(np.setdiff1d(entry.top, [-1])) / period.n_items,
+            "intervals": dict(zip(MEASURES, ends[:, row].T.tolist(), strict=True)),
+            "differences": dict(zip(MEASURES, differences[:, row].T.tolist(), strict=True)),
+        }
         for row, (name, entry) in enumerate(ranked.items())
-    ]
+    }
 
 
 def _find_ends(resampled: Float64Array) -> Float64Array:

@@ -2,11 +2,12 @@
 training rows, on the same later steps."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -21,7 +22,6 @@ from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import (
-    Compared,
     Later,
     LikedExpression,
     Period,
@@ -55,7 +55,6 @@ _OTHERWISE: Final = "hit_rate_shown"
 _KNN_HISTORY: Final = 20
 """Latest rows of the user that item-kNN reads."""
 _ALS_FACTORS: Final = 32
-_Factors = Literal["als", "bpr"]
 
 
 class PolicyRanker:
@@ -100,11 +99,11 @@ def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> NamedRanker:
     return NamedRanker("item-knn", scores)
 
 
-def factor_ranker(
-    name: _Factors, train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
-) -> NamedRanker:
-    """Ranks items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
-    or BPR (Rendle et al., 2009); needs the package `implicit`."""
+def factor_rankers(
+    train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
+) -> Iterator[NamedRanker]:
+    """Rank items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
+    and BPR (Rendle et al., 2009); needs the package `implicit`."""
     from implicit.als import AlternatingLeastSquares
     from implicit.bpr import BayesianPersonalizedRanking
     from threadpoolctl import threadpool_limits
@@ -116,22 +115,22 @@ def factor_ranker(
     shape = (int(users.max()) + 1, len(popularity))
     matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
     matrix.eliminate_zeros()
-    kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
-    model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
-    with threadpool_limits(1, "blas"):
-        model.fit(matrix, show_progress=False)
-    # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
-    factors = np.pad(np.asarray(model.user_factors), ((0, 1), (0, 0)))
-    factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
-    of_users = torch.from_numpy(factors.astype(np.float32))
-    of_items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
     tie_break = 1e-6 * popularity / popularity.max()
 
-    def scores(steps: Steps) -> Tensor:
+    def scores(of_users: Tensor, of_items: Tensor, steps: Steps) -> Tensor:
         rows = np.where(steps.users < len(of_users) - 1, steps.users, -1)
         return of_users[torch.from_numpy(rows)] @ of_items.T + tie_break
 
-    return NamedRanker(name, scores)
+    for name, kind in (("als", AlternatingLeastSquares), ("bpr", BayesianPersonalizedRanking)):
+        model = kind(factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
+        with threadpool_limits(1, "blas"):
+            model.fit(matrix, show_progress=False)
+        # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
+        factors = np.pad(np.asarray(model.user_factors), ((0, 1), (0, 0)))
+        factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
+        of_users = torch.from_numpy(factors.astype(np.float32))
+        of_items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
+        yield NamedRanker(name, partial(scores, of_users, of_items))
 
 
 def baselines(
@@ -173,10 +172,7 @@ def baselines(
 
         rankers.append(NamedRanker("boosted clicks", scores))
         if find_spec("implicit") is not None:
-            rankers += [
-                factor_ranker(name, train, impressions.float(), seed, liked_of)
-                for name in get_args(_Factors)
-            ]
+            rankers += factor_rankers(train, impressions.float(), seed, liked_of)
     if train is not None and store is not None and store.split("validation").n_episodes:
         first, validation = store.split("train"), store.split("validation")
         for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
@@ -265,14 +261,16 @@ def ranking_rows(
         **provenance(),
     }
     return [
-        _row(compared, policy_rankers.get(compared.name), shared)
-        for compared in compare(period, ranked, reference, seed)
+        _row(name, measured, policy_rankers.get(name), shared)
+        for name, measured in compare(period, ranked, reference, seed).items()
     ]
 
 
-def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:
+def _row(
+    name: str, measured: Mapping[str, Any], policy: PolicyRanker | None, shared: Mapping[str, Any]
+) -> ResultRow:
     """The row of one ranker; `policy` is the ranker if it is a trained policy."""
-    row = ResultRow(method=compared.name, policy=compared.name, **shared)
+    row = ResultRow(method=name, policy=name, **shared)
     if policy is not None:
         rule, record = policy.rule, policy.trained.record
         row = row.extended(
@@ -282,13 +280,7 @@ def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, A
             training_seed=record.seed,
             config_hash=config_hash(record.settings),
         )
-    metric = METRIC if math.isfinite(compared.values[METRIC]) else _OTHERWISE
-    low, high = compared.intervals[metric]
+    metric = METRIC if math.isfinite(measured[METRIC]) else _OTHERWISE
+    low, high = measured["intervals"][metric]
     interval = (low, high) if math.isfinite(low + high) else None
-    measured = {
-        **compared.values,
-        "coverage": compared.coverage,
-        "intervals": compared.intervals,
-        "differences": compared.differences,
-    }
     return row.extended(measured, interval=interval, metric=metric)

@@ -122,23 +122,14 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
 
 def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
     """Estimates with intervals, of terms of S units, each of a user (S,), by estimator."""
-    above = np.stack([term.above for term in terms.values()], axis=1)
-    below = np.stack([term.below for term in terms.values()], axis=1)
-    estimates = {}
-    intervals = cluster_intervals(above, below, user, seed)
+    above, below = np.stack([(term.above, term.below) for term in terms.values()], axis=2)
+    estimates, intervals = {}, cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
         low, high, error, _ = NO_INTERVAL if term.biased or interval is None else interval
         value, weights = float(term.above.sum() / term.below.sum()), term.weights
         largest = float(weights.max() / weights.sum()) if weights.any() else 1.0
-        estimates[name] = Estimate(
-            value=value,
-            low=low,
-            high=high,
-            error=error,
-            effective_sessions=effective_number(weights),
-            largest_weight=largest,
-            parameter=term.parameter,
-        )
+        effective = effective_number(weights)
+        estimates[name] = Estimate(value, low, high, error, effective, largest, term.parameter)
     return estimates
 
 

@@ -158,6 +158,9 @@ class Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen."""
         await super().startup(sockets)
+        if self.started and self.should_exit:  # a signal came; uvicorn would cancel the application
+            await self.shutdown(sockets)
+            return
         for bound in sockets or []:
             bound.listen(_BACKLOG)
             self._ready(bound)

@@ -212,8 +212,9 @@ def train_run(
                     rule = _choose_rule(run, users, initial)
                 record = record.copy_with(reward_model=users.reward_report, rule=rule)
                 del users  # what follows reads the reward model of the run
-            scorer = TrainedPolicy.load(out, in_training=True).scorer()
-            write_json(out / SAMPLES, sample_recommendations(scorer, run.held_out))
+            if not (out / SAMPLES).exists():  # a resumed refit has the rule of its run by now
+                scorer = TrainedPolicy.load(out, in_training=True).scorer()
+                write_json(out / SAMPLES, sample_recommendations(scorer, run.held_out))
         seconds = record.wall_time_s + time.perf_counter() - start
         return record.copy_with(wall_time_s=seconds).seal(out)
 

@@ -80,7 +80,7 @@ class UserModel:
         users = None
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
-            users.model.likeness = reward.likeness  # of the same items, in memory once
+            users[0].likeness = reward.likeness  # of the same items, in memory once
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             fatigue = calibration = None

@@ -157,8 +157,7 @@ def _wider_type(kind: str) -> str:
 
 def glob_pattern(file: Path) -> str:
     """Glob pattern that matches only `file`: DuckDB treats every path as a pattern."""
-    # Of "~" at the begin, it would make the folder of the user.
-    return re.sub("^~", "./~", _MAGIC.sub(r"[\g<0>]", str(file)))
+    return _MAGIC.sub(r"[\g<0>]", str(file))
 
 
 def quote(value: str) -> str:

@@ -339,7 +339,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     late.to_parquet(folder / "late.parquet")
     late.to_csv(folder / "late.csv", index=False)
     plain(late).to_parquet(folder / "plain.parquet")
-    # As `join` writes it; `uid` is feedback here.
     times = {"timestamp": plain(late).timestamp.astype("datetime64[ms]").astype("int64")}
     shown = {"position": 1, "run": "r", "rule": "d", "uid": 0, "agent": "person"}
     plain(late).assign(**times, **shown).to_parquet(folder / "joined.parquet")

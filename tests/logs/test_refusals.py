@@ -95,10 +95,9 @@ def latin(folder: Path) -> None:
 
 
 def nested(folder: Path) -> None:
-    values, kind = pa.array([1] * 400), pa.int64()
+    values = pa.array([1] * 400)
     for _ in range(40):
-        kind = pa.list_(kind)
-        values = pa.ListArray.from_arrays(pa.array(range(401), pa.int32()), values, kind)
+        values = pa.ListArray.from_arrays(pa.array(range(401), pa.int32()), values)
     log = pa.Table.from_pandas(random_log()).append_column("tree", values)
     pq.write_table(log, folder / "log.parquet")
     validate([folder / "log.parquet"], LogMapping({"observation": "tree"}))

@@ -2,13 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from tests.support.killed import kills
 from tests.support.later import NEW, later_log, later_mapping
 from tests.support.served import SETTINGS, trained_run
-from tests.support.tagged import ITEMS
+from tests.support.tagged import ITEMS, tagged_log
 from tests.support.tensors import assert_same_tensors
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
@@ -16,6 +18,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.logs.append import AppendOptions
+from ucfrec.runs.promoted import promoted
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
@@ -82,27 +85,6 @@ def test_the_same_command_goes_on_and_another_is_refused(
     assert "run folder" in capsys.readouterr().err
 
 
-def test_the_command_says_what_was_read_and_what_is_better(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["update", str(folder / "run"), str(folder / "later.parquet")]
-    arguments += ["--out", str(tmp_path / "run2"), "--window", "20d", "--split", "0.5,0.25,0.25"]
-    assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "new rows      300 of 300 read (0 not newer" in said
-    assert "of the new rows have new items, " in said
-    assert "the old run's reward model predicts " in said
-    assert "verdict " in said
-    record = RunRecord.read(tmp_path / "run2")
-    assert record.update.verdict.steps == 75
-    old, new = TrainedPolicy.load(folder / "run").rule, record.rule.rule
-    changed = f"rule changed  {old} → {new}" if new != old else ""
-    assert changed in said
-    assert ("rule changed" in said) == bool(changed)
-    assert main([*arguments[:5], "--window", "soon"]) == 2
-    assert "--window soon is not a duration" in capsys.readouterr().err
-
-
 def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:
     settings = [*SETTINGS, "augment.copies=1", "crm.epochs=12"]
     Recommender("ucf", settings).fit(EpisodeStore.open(folder / "store"), tmp_path / "run")
@@ -133,6 +115,55 @@ def test_a_folder_that_is_no_update_is_refused_before_a_store_is_written(
         with pytest.raises(InputError, match="is not an update of"):
             update_run(folder / "run", [folder / "later.parquet"], tmp_path / name)
         assert not (tmp_path / f"{name}-store").exists()
+
+
+def test_the_documented_night_runs_on_the_first_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The mapping is that of the shop's own log; the joined log has the columns of exposures."""
+    monkeypatch.chdir(tmp_path)
+    log, items = tagged_log(), [f"s{item}" for item in range(ITEMS)]
+    shop = {"visitor": "v" + log.user_id.astype(str), "sku": "s" + log.item_id.astype(str)}
+    shop |= {"seen": log.timestamp / 1000, "clicked": log.reward > 0, "bought": log.item_id == 3}
+    pd.DataFrame(shop).to_parquet("shop.parquet")
+    pd.DataFrame({"sku": items, "price": np.arange(ITEMS) * 1.0}).to_parquet("items.parquet")
+    Path("shop.toml").write_text(
+        'reward = "clicked::INT + 5 * bought::INT"\n[columns]\nuser_id = "visitor"\n'
+        'item_id = "sku"\ntimestamp = "seen * 1000"\n'
+        '[[item_features]]\nfiles = ["items.parquet"]\nkey = "sku"\n'
+    )
+
+    def run(command: str) -> None:
+        assert main(command.split()) == 0, command
+
+    run("prepare shop.parquet --mapping shop.toml --out store")
+    run(f"train store --out runs/first --set {' --set '.join(SETTINGS)}")
+    run("promote runs/first")
+    files = "--exposures shown.parquet --out recommended.parquet"
+    run(f"recommend runs/first shop.parquet --k 2 --temperature 1 --keep-seen {files}")
+    shown = pd.read_parquet("shown.parquet")
+    shown["timestamp"] += np.arange(len(shown)) * 1000  # as of requests one after the other
+    shown.to_parquet("shown.parquet")
+    clicks = shown[["user_id", "item_id", "timestamp"]][::3]
+    clicks.assign(clicked=True, bought=False).to_parquet("clicks.parquet")
+    run("join shown.parquet clicks.parquet --within 30m --out log.parquet")
+    updated = "update runs log.parquet --mapping shop.toml --filter-seen --out runs/second"
+    run(f"{updated} --window 60d")
+    said = capsys.readouterr().out
+    for part in (
+        "new rows      60 of 60 read (0 not newer",
+        "of the new rows have new items, ",
+        "the old run's reward model predicts ",
+        "verdict ",
+    ):
+        assert part in said
+    assert main([*updated.split(), "--window", "soon"]) == 2
+    assert "--window soon is not a duration" in capsys.readouterr().err
+    update = RunRecord.read(Path("runs/second")).update
+    assert update.appended["steps"] == 60
+    assert (update.drift["unknown_items"], update.drift["unknown_users"]) == (0, 0)
+    run("promote runs/second --force")
+    assert promoted(Path("runs")).current == "second"
 
 
 @pytest.mark.slow

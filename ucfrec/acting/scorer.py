@@ -584,8 +584,7 @@ def _are_equal(first: Likeness, second: Likeness) -> bool:
 
 def _pad(values: Tensor, length: int, padding: int) -> Tensor:
     """The first `length` columns of values (B, N), with more columns where there are fewer."""
-    missing = max(0, length - values.shape[1])
-    values = values[:, :length]
+    missing = length - values.shape[1]
     return F.pad(values, (0, missing), value=padding) if missing else values
 
 

@@ -310,8 +310,7 @@ def _some_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
     size = max(_BLOCK, round((n / k) ** 0.5))
     blocks = n // size
     if scores.numel() < _FEW or 3 * k > blocks:
-        values, numbers = scores.topk(k, dim=-1)
-        return values, numbers
+        return scores.topk(k, dim=-1)
     maxima = scores[:, : blocks * size].view(len(scores), blocks, size).amax(-1)
     first = maxima.topk(k, dim=-1, sorted=False).indices * size
     numbers = (first.unsqueeze(-1) + torch.arange(size)).flatten(1)

@@ -32,7 +32,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()
     """Log files, folders or globs; also at s3://, …"""
     out: Annotated[Path | None, OUTPUT] = None
-    """Parquet or CSV file (with --engine spark: folder) to write."""
+    """Parquet or CSV file (on Spark: folder) to write."""
     stream: bool = False
     """Instead of LOGS and --out: read requests from stdin, JSON on each line, and write answers to
     stdout; see docs/serving.md"""

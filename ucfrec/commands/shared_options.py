@@ -196,8 +196,7 @@ class AnswerOptions(RuleOptions):
     k: Annotated[int, Group("")] = 10
     """Items for each user; if a request does not say how many."""
     exposures: Annotated[Path | None, Group(""), "PATH"] = None
-    """Write what was shown, with its probability: a file (Parquet or CSV), a folder of Parquet
-    files for requests; see docs/exposures.md"""
+    """Write what was shown, with its probability; a folder for requests; see docs/exposures.md"""
     keep_seen: Annotated[bool, Group("")] = False
     """Also recommend items that the user has seen; (default: leave them out)"""
     skip_unknown: bool = False

@@ -92,7 +92,7 @@ def export(
             scores differ from torch's, or `out` exists.
     """
     _require_installed()
-    graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
+    graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
     example = _draw_inputs(graph.scorer, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: list[dict[int, Any]] = [{0: batch} for _ in example]
@@ -136,10 +136,7 @@ class RuleGraph(_Network):
     """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
 
     def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
-        if scorer.states is None:
-            raise InputError(
-                "this policy's actions are vectors; only policies of items can be exported"
-            )
+        assert scorer.states is not None
         super().__init__(
             scorer,
             kind,

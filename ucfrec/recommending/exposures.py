@@ -35,17 +35,17 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
     """Columns of exposures: users are text, as any client names them; items as in the run."""
     item = pa.int64() if trained.items.ids.dtype.kind in "iu" else pa.string()
     return pa.schema(
-        [
-            (schema.USER_ID, pa.string()),
-            (schema.ITEM_ID, item),
-            (schema.TIMESTAMP, pa.int64()),
-            (schema.REQUEST_ID, pa.string()),
-            (schema.POSITION, pa.int32()),
-            (schema.PROPENSITY, pa.float64()),
-            (schema.RUN, pa.string()),
-            (schema.RULE, pa.string()),
-            (schema.ARM, pa.string()),
-        ]
+        {
+            schema.USER_ID: pa.string(),
+            schema.ITEM_ID: item,
+            schema.TIMESTAMP: pa.int64(),
+            schema.REQUEST_ID: pa.string(),
+            schema.POSITION: pa.int32(),
+            schema.PROPENSITY: pa.float64(),
+            schema.RUN: pa.string(),
+            schema.RULE: pa.string(),
+            schema.ARM: pa.string(),
+        }
     )
 
 

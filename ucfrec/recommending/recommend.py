@@ -230,15 +230,13 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
 
 
 def _refuse_unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
-    rows, items = 0, set[Any]()
-    for batch in batches:
-        unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
-        rows += len(unknown)
-        items |= set(unknown.tolist())
+    unknown = [ids[index.numbers(ids) < 0] for ids in (batch.item_ids for batch in batches)]
+    rows = np.concatenate(unknown).tolist()
+    items = sorted(set(rows))
     return InputError(
-        f"{rows} rows have an item_id that the policy does not know ({len(items)} items: "
-        f"{name_some(sorted(items))}); prepare and train on logs with them, or leave those rows "
-        "out with --skip-unknown (skip_unknown=True in Python)"
+        f"{len(rows)} rows have an item_id that the policy does not know ({len(items)} items: "
+        f"{name_some(items)}); prepare and train on logs with them, or leave those rows out with "
+        "--skip-unknown (skip_unknown=True in Python)"
     )
 
 

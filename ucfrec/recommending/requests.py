@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -215,7 +214,7 @@ class RowRewards:
         if not self._computed and any(value is not None for value in rewards):
             return _require_numbers(rewards, f"no {schema.REWARD}, as other rows have")
         name = str(self._expression)
-        if re.fullmatch(r"[A-Za-z_]\w*", name):
+        if name.isidentifier():
             either = "no" if name == schema.REWARD else f"neither {schema.REWARD} nor"
             return _require_numbers(_column(rows, name), f"{either} {name}")
         return _require_numbers(self._evaluate(rows), "no reward")

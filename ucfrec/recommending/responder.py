@@ -16,12 +16,12 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
+from ucfrec.recommending.exposures import exposure_schema
 from ucfrec.recommending.recommend import Chooser, candidate_numbers, name_some
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, id_array
 from ucfrec.runs.promoted import POINTER, Promoted, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-TORCH: Final = "torch"
 ONNXRUNTIME: Final = "onnxruntime"
 _LARGEST_EXACT: Final = 2**53 - 1
 """Largest integer that JavaScript holds exactly."""
@@ -107,7 +107,7 @@ class Responder:
         filter_seen: bool = True,
         skip_unknown: bool = False,
         seed: int = 0,
-        engine: str = TORCH,
+        engine: str = "torch",
     ) -> None:
         """As `recommend`; draws depend on user and request_id.
 
@@ -393,8 +393,7 @@ class Served:
 
 def _require_alike(new: TrainedPolicy, old: TrainedPolicy) -> None:
     """Check that exposures of both can be in one file: that items are text in both, or numbers."""
-    of_new, of_old = (trained.items.ids.dtype.kind in "iu" for trained in (new, old))
-    if of_new != of_old:
+    if exposure_schema(new) != exposure_schema(old):
         raise InputError(f"{new.folder}: items are not of the same type as in {old.folder}")
 
 

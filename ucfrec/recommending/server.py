@@ -286,12 +286,13 @@ class Workers:
         """End the workers after the requests in flight, or at once when interrupted meanwhile;
         InputError with what failed in them at the end."""
         self._listening.close()
+        # An interruption may have come before one started.
+        self._workers = [worker for worker in self._workers if worker.process.pid is not None]
         try:
             self._ask_and_wait()
         except Interrupted:
             self._ask_and_wait()
-        begun = [worker for worker in self._workers if worker.process.pid is not None]
-        failures = dict.fromkeys(each.failure for each in begun if each.receive() == "failed")
+        failures = dict.fromkeys(w.failure for w in self._workers if w.receive() == "failed")
         self._workers.clear()
         if failures:
             raise InputError("; ".join(failures))
@@ -301,8 +302,7 @@ class Workers:
             with suppress(OSError):
                 worker.connection.send("end")
         for worker in self._workers:
-            if worker.process.pid is not None:  # an interruption came before it started
-                worker.process.join()
+            worker.process.join()
 
     def _start(self) -> None:
         ours, theirs = _SPAWN.Pipe()

@@ -119,7 +119,7 @@ class _Metrics:
             shared: count for all processes that share the folder PROMETHEUS_MULTIPROC_DIR.
         """
         registry = CollectorRegistry()
-        self._measure_drift, self._shared = drift, shared
+        self._measure_drift = drift
         self._collector: Collector = registry
         text = "Requests for recommendations, by HTTP status."
         self._requests = Counter("ucfrec_requests", text, ["status"], registry=registry)
@@ -159,7 +159,7 @@ class _Metrics:
         """Count a forward pass."""
         self._sizes.observe(requests)
         self._passes.observe(seconds)
-        if self._shared:
+        if self._cpu is not None:
             self._update()
 
     def write_text(self) -> bytes:

@@ -82,7 +82,7 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
+    """Write a folder with the graph (`model.onnx`, see `_write_graph`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
@@ -106,8 +106,8 @@ def export(
     names = list(arguments), list(OUTPUTS)
     with atomic_folder(out) as scratch:
         path, difference = scratch / GRAPH, 0.0
-        write_graph(graph, inputs, path, names, trained.name, _SERVE, shapes)
-        runner = start_runner(path)
+        _write_graph(graph, inputs, path, names, trained.name, _SERVE, shapes)
+        runner = _start_runner(path)
         for sessions in (_COMPARED, 1):
             arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
             results = _run_graph(runner, arguments)
@@ -234,8 +234,8 @@ class ScoreGraph:
         names = list(example), ["scores"]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / GRAPH
-            write_graph(network, tuple(example.values()), path, names, kind, _TORCH)
-            self._runner = start_runner(path, threads=1)
+            _write_graph(network, tuple(example.values()), path, names, kind, _TORCH)
+            self._runner = _start_runner(path, threads=1)
         size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = draw_example(seed=number)
@@ -291,7 +291,7 @@ def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def start_runner(path: Path, threads: int = 0) -> Any:
+def _start_runner(path: Path, threads: int = 0) -> Any:
     """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
     import onnxruntime
 
@@ -348,7 +348,7 @@ def _require_installed() -> None:
         ) from None
 
 
-def write_graph(
+def _write_graph(
     module: nn.Module,
     arguments: tuple[Tensor, ...],
     path: Path,

@@ -79,7 +79,7 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
+    """Write a folder with the graph (`model.onnx`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
@@ -100,8 +100,8 @@ def export(
     with atomic_folder(out) as scratch:
         path, difference = scratch / GRAPH, 0.0
         sizes = {"inputs": tuple(shapes)}
-        write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
-        runner = start_runner(path)
+        _write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
+        runner = _start_runner(path)
         for sessions in (_COMPARED, 1):
             example = _draw_inputs(graph.scorer, sessions, seed=sessions)
             difference = max(difference, _measure_difference(graph, runner, example, _SERVE))
@@ -186,8 +186,8 @@ class ScoreGraph:
         example = _draw_inputs(scorer, 1, seed=0, mask=True)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / GRAPH
-            write_graph(network, example, path, ["scores"], kind, _TORCH)
-            self._runner = start_runner(path, threads=1)
+            _write_graph(network, example, path, ["scores"], kind, _TORCH)
+            self._runner = _start_runner(path, threads=1)
         for number in range(1, 1 + _COMPARED):
             example = _draw_inputs(scorer, 1, seed=number, mask=True)
             _measure_difference(network, self._runner, example, _TORCH)
@@ -241,7 +241,7 @@ def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
     return {name: v for name, v in zip(_STATE, values, strict=True) if v is not None}
 
 
-def start_runner(path: Path, threads: int = 0) -> Any:
+def _start_runner(path: Path, threads: int = 0) -> Any:
     """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
     import onnxruntime
 
@@ -303,7 +303,7 @@ def _require_installed() -> None:
             raise InputError(f"ONNX needs {name}, which is not installed; install ucfrec[export]")
 
 
-def write_graph(
+def _write_graph(
     module: nn.Module,
     inputs: dict[str, Tensor],
     path: Path,

@@ -1,6 +1,5 @@
 """`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -36,8 +35,6 @@ NEEDS = {
 }
 """What every kind of figure is made of."""
 _REMEDY = "measure it again"
-_SWEPT = re.compile(r"(ucf-paper|ucf)(-lambda-.+)?$")
-"""Methods that differ in λ only."""
 
 
 @dataclass(frozen=True)
@@ -151,19 +148,16 @@ def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     swept = [
         row
         for row in clean
-        if _SWEPT.match(row.method)
+        if row.method.partition("-lambda-")[0] in ("ucf", "ucf-paper")
         and row.table in ("lambda", EVALUATE)
         and row.conditions.get("lambda_mask") is not None
     ]
-    families = grouped(swept, lambda row: (row.conditions.get("budget", "rows"), _family(row)))
+    families = grouped(
+        swept,
+        lambda row: (row.conditions.get("budget", "rows"), row.method.partition("-lambda-")[0]),
+    )
     for (budget, family), rows_of_family in families.items():
         lines = [row.as_line() for row in rows_of_family]
         if len({line["lambda_mask"] for line in lines}) > 1:
             name = f"{budget}-{family}".removesuffix("-ucf")
             yield _Plan("lambda", name, partial(plots.lambda_curves, lines))
-
-
-def _family(row: ResultRow) -> str:
-    """The method whose λ a row varies."""
-    matched = _SWEPT.match(row.method)
-    return "" if matched is None else matched[1]

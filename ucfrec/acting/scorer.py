@@ -459,7 +459,7 @@ class _ItemProduct:
 
     def pad_items(self, recent: Shown) -> Tensor:
         """(B, N) the items that repetition and likeness refer to."""
-        return recent.padded(self._columns).items
+        return _pad(recent.items, self._columns, -1)
 
     def policy_part(self, windows: Windows, recent: Shown) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from windows with their target returns."""
@@ -468,10 +468,13 @@ class _ItemProduct:
         features = self._features(normalized)
         repeated = alike = features.new_zeros(features.shape[0], self._columns)
         if self._exposure is not None:
-            items, rewards = (values.to(device) for values in recent.padded(self.lags))
-            exposed = Exposed(items, rewards, normalized.returns_to_go[:, -1])
+            exposed = Exposed(
+                _pad(recent.items, self.lags, -1).to(device),
+                _pad(recent.rewards, self.lags, 0).to(device),
+                normalized.returns_to_go[:, -1],
+            )
             repeated, alike = (
-                _pad(weights, self._columns) for weights in self._exposure.weights(exposed)
+                _pad(weights, self._columns, 0) for weights in self._exposure.weights(exposed)
             )
         part = Part(features / features.shape[-1] ** 0.5, repeated, alike)
         if device.type == "cpu":
@@ -485,7 +488,7 @@ class _ItemProduct:
         query = model.query(states, sessions.users, model.tastes_after(recent))
         _, repeated, alike = model.exposures(recent)
         factors = F.pad(query, (0, 1), value=1.0)
-        return Part(factors, _pad(repeated, self._columns), _pad(alike, self._columns))
+        return Part(factors, _pad(repeated, self._columns, 0), _pad(alike, self._columns, 0))
 
     def _counts_shown(self, policy: bool, rewards: bool) -> bool:
         """Whether what was shown counts."""
@@ -579,10 +582,11 @@ def _are_equal(first: Likeness, second: Likeness) -> bool:
     return all(torch.equal(left.cpu(), right.cpu()) for left, right in pairs)
 
 
-def _pad(weights: Tensor, length: int) -> Tensor:
-    """Weights (B, N), with zeros up to `length` columns where there are fewer."""
-    missing = length - weights.shape[1]
-    return F.pad(weights, (0, missing)) if missing else weights
+def _pad(values: Tensor, length: int, padding: int) -> Tensor:
+    """The first `length` columns of values (B, N), with more columns where there are fewer."""
+    missing = max(0, length - values.shape[1])
+    values = values[:, :length]
+    return F.pad(values, (0, missing), value=padding) if missing else values
 
 
 def sessions_before(

@@ -467,11 +467,30 @@ class ActionGenerator:
         # In float64, so that a later check confirms what passes.
         view, exact = self.view, copy.deepcopy(self.crm).double()
         rng = np.random.default_rng([seed, _ACTION_STREAM])
-        chunks = []
-        for start in range(0, max(1, len(steps)), _ACTION_CHUNK):
-            part = slice(start, start + _ACTION_CHUNK)
-            drawn, *rest = self._predict(exact, episodes[part], steps[part], count, rng)
-            chunks.append((drawn + start, *rest))
+
+        @torch.no_grad()
+        def predict(start: int) -> tuple[IntArray, Array, Array, BoolArray]:
+            """Draw at some of the steps: their numbers, other actions, predicted rewards, and
+            whether the model reproduces the logged reward."""
+            drawn_at = np.arange(start, min(start + _ACTION_CHUNK, len(steps)))
+            at = episodes[drawn_at], steps[drawn_at]
+            factual = read_transitions(view, *at, self.item_rewards).to(self.crm.device)
+            s, a, r = (v.double() for v in (factual.states, factual.actions, factual.rewards))
+            z = exact.abduct(s, a, r)
+            reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
+            labels = self.clusters.nearest(self.crm.normalise_states(factual.states).cpu()).numpy()
+            rows = np.repeat(np.arange(len(drawn_at)), count)
+            actions, drawable = self.support.draw(labels[rows], rng)
+            logged = read_actions(view, at[0][rows], at[1][rows])
+            differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
+            rows, actions = rows[differs], actions[differs]
+            changed = read_transitions(
+                view, at[0][rows], at[1][rows], self.item_rewards, actions
+            ).actions
+            predicted = exact.predict(s[rows], changed.to(s), z[rows]).cpu().numpy()
+            return drawn_at[rows], actions, predicted, reproduced[rows]
+
+        chunks = map(predict, range(0, max(1, len(steps)), _ACTION_CHUNK))
         rows, actions, predicted, reproduced = map(np.concatenate, zip(*chunks, strict=True))
         logged_rewards = view.column(schema.REWARD)
         reward = predicted.clip(logged_rewards.min(), logged_rewards.max()).astype(np.float32)
@@ -494,36 +513,6 @@ class ActionGenerator:
             action_reward=reward[accepted],
         )
         return copies, report
-
-    @torch.no_grad()
-    def _predict(
-        self,
-        exact: CausalRewardModel,
-        episodes: IntArray,
-        steps: IntArray,
-        count: int,
-        rng: np.random.Generator,
-    ) -> tuple[IntArray, Array, Array, BoolArray]:
-        """Draw other actions at some of the steps: their numbers, the actions, predicted rewards,
-        and whether the model reproduces the logged reward."""
-        factual = read_transitions(self.view, episodes, steps, self.item_rewards)
-        factual = factual.to(self.crm.device)
-        s, a, r = (values.double() for values in (factual.states, factual.actions, factual.rewards))
-        z = exact.abduct(s, a, r)
-        reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
-        rows = np.repeat(np.arange(len(steps)), count)
-        states = self.crm.normalise_states(factual.states).cpu()
-        labels = self.clusters.nearest(states).numpy()
-        actions, drawable = self.support.draw(labels[rows], rng)
-        logged = read_actions(self.view, episodes[rows], steps[rows])
-        differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
-        rows, actions = rows[differs], actions[differs]
-        changed = read_transitions(
-            self.view, episodes[rows], steps[rows], self.item_rewards, actions
-        )
-        at = torch.from_numpy(rows).to(s.device)
-        predicted = exact.predict(s[at], changed.actions.to(s), z[at])
-        return rows, actions, predicted.cpu().numpy(), reproduced[rows]
 
 
 def read_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -116,17 +116,6 @@ class ActionSupport:
         return self._actions[places], end > first
 
 
-class Generator(Protocol):
-    """Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
-
-    band: tuple[float, float]
-    """(ρ_low, ρ_high), see `CSGConfig`."""
-
-    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
-        """A state s_c (M, S) for each of M steps with abduced disturbances (M, latent_dim), such
-        that f̂_r(s_c, a, z) is close to f̂_r(s, a, z). Draws by a `generator` on the CPU."""
-
-
 class TangentGenerator:
     """Random moves along the level set of the predicted reward, which are not in the paper.
 
@@ -144,7 +133,8 @@ class TangentGenerator:
 
     @torch.no_grad()
     def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
-        """See `Generator.propose`."""
+        """A state s_c (M, S) for each of M steps with abduced disturbances (M, latent_dim), such
+        that f̂_r(s_c, a, z) is close to f̂_r(s, a, z). Draws by a `generator` on the CPU."""
         crm, states = self._crm, at.states
         near = self._clusters.nearest(crm.normalise_states(states))
         noise = torch.randn(states.shape, generator=generator).to(states.device)
@@ -192,7 +182,7 @@ class CounterfactualStateGenerator(nn.Module):
 
     @torch.no_grad()
     def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
-        """See `Generator.propose`; deterministic."""
+        """See `TangentGenerator.propose`; deterministic."""
         return at.states + self._crm[0].state_std * self.move(at.states, at.actions, z)
 
 
@@ -203,11 +193,15 @@ class NoiseGenerator:
         self._std, self.band = crm.state_std, config.band
 
     def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
-        """See `Generator.propose`."""
+        """See `TangentGenerator.propose`."""
         noise = torch.randn(at.states.shape, generator=generator).to(at.states.device)
         noise = noise * (self._std > 0)
         length = _lengths(self.band, at.states, generator)
         return at.states + self._std * _scale(noise, length, math.inf)
+
+
+Generator = TangentGenerator | CounterfactualStateGenerator | NoiseGenerator
+"""Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
 
 
 def state_clusters(

@@ -49,9 +49,10 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     }
     if out == first / REFIT:
         entries |= place_of(store.path, first)
-    store = drop_columns(store, trained.record.dropped_observations)
-    config = trained.record.config
-    steps = max(1, round(SHARE * trained.record.finished.best_step))
+    chosen, has_reward_model = trained.record, trained.reward_model is not None
+    del trained  # the memory of its items, which the training needs
+    store, config = drop_columns(store, chosen.dropped_observations), chosen.config
+    steps = max(1, round(SHARE * chosen.finished.best_step))
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))
@@ -60,11 +61,10 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         return record
     record = record.reopen(out, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)
-    if trained.reward_model is not None:
+    if has_reward_model:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
         if (first / REWARD_MODEL / SESSIONS).exists():
             shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
-    chosen = trained.record
     record = record.copy_with(rule=chosen.rule, reward_model=chosen.reward_model)
     return record.copy_with(screening=chosen.screening, update=chosen.update).seal(out)
 

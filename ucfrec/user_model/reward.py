@@ -244,8 +244,9 @@ class ItemRewardModel(nn.Module):
 
     def exposures(self, history: Shown) -> tuple[Tensor, Tensor, Tensor]:
         """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
-        items, rewards = history.padded(self.lags)
-        liked = self.scale_rewards(rewards)
+        missing = max(0, self.lags - history.items.shape[1])
+        items = F.pad(history.items[:, : self.lags], (0, missing), value=-1)
+        liked = self.scale_rewards(F.pad(history.rewards[:, : self.lags], (0, missing)))
         repeated, alike, repeated_liked, alike_liked = self.exposure
         return items, repeated + repeated_liked * liked, alike + alike_liked * liked
 

@@ -228,6 +228,7 @@ def set_statistics(
     model.reward_std.copy_(rewards.std(correction=0))
     exact = rows.states.double()
     mean, spread = exact.mean(0), exact.std(0, correction=0)
+    del exact  # of a large catalogue, the next one takes as much memory
     model.state_mean.copy_(mean)
     constant = spread <= _CONSTANT * mean.abs().clamp(min=1.0)
     model.state_std.copy_(torch.where(constant, torch.inf, spread))

@@ -66,7 +66,7 @@ def main() -> int:
             for fault, number in faults[: 1 if mutant else None]:
                 print(f"    {number} × {fault}", flush=True)
             if mutant and not faults:
-                print(f"    not found: ucfrec without {mutant.name}", flush=True)
+                print(f"    not found: ucfrec without {mutant[0]}", flush=True)
             failed += not faults if mutant else sum(number for _, number in faults)
     print(f"{failed} {'mutants not found' if options.mutants else 'faults'}")
     return int(failed > 0)

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
 
+_DEEP: Final = "[]" * 20
 _MAGIC = re.compile(r"[\[*?]")
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
@@ -282,6 +283,9 @@ def _columns(
     source = Table((file,), ()).source
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
+        # DuckDB takes very long to cast these.
+        if deep := [name for name, kind, *_ in types if _DEEP in kind]:
+            raise InputError(f"{file}: {deep[0]} holds lists in lists, too deep; remove the column")
         if is_parquet:
             metadata = f"parquet_file_metadata({quote(glob_pattern(file))})"
             ((rows,),) = connection.sql(f"SELECT num_rows FROM {metadata}").fetchall()

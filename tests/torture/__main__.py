@@ -66,7 +66,7 @@ def main() -> int:
             for fault, number in faults[: 1 if mutant else None]:
                 print(f"    {number} × {fault}", flush=True)
             if mutant and not faults:
-                print(f"    not found: ucfrec without {mutant.name}", flush=True)
+                print(f"    not found: ucfrec without {mutant[0]}", flush=True)
             failed += not faults if mutant else sum(number for _, number in faults)
     print(f"{failed} {'mutants not found' if options.mutants else 'faults'}")
     return int(failed > 0)
@@ -74,7 +74,7 @@ def main() -> int:
 
 def list_parts(folder: Path, cases: dict[str, float], mutated: bool, seed: int) -> Iterator[Part]:
     """The parts of the checks in `cases`, each of which has a case at least; if `mutated`, those
-    that a mutant breaks, of six cases at least."""
+    that a mutant breaks, of some cases at least."""
     inputs = Inputs(folder)
     jobs, readers = inputs.jobs(), list_readers(inputs)
     ends = cache(partial(Ends.of, inputs, folder))
@@ -85,7 +85,8 @@ def list_parts(folder: Path, cases: dict[str, float], mutated: bool, seed: int) 
         return check in cases and (not mutated or (check, part) in MUTANTS)
 
     def share(check: str, part: int, whole: int) -> int:
-        return max(6 if mutated else 1, round(cases[check] * part / whole))
+        least = {"fuzz": 30}.get(check, 6) if mutated else 1
+        return max(least, round(cases[check] * part / whole))
 
     for check in ("kills", "interruptions", "pairs"):
         for job in jobs:

@@ -50,10 +50,13 @@ class End:
 class Running:
     """A function in a fork; its stderr goes to a file, its stdout to nowhere.
 
-    With `memory`, the fork gets no more than that many bytes beyond what this process has.
+    With `memory`, the fork gets no more than that many bytes beyond what this process has; with
+    `largest`, no file may have more bytes.
     """
 
-    def __init__(self, work: Callable[[], int], memory: int | None = None) -> None:
+    def __init__(
+        self, work: Callable[[], int], memory: int | None = None, largest: int | None = None
+    ) -> None:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         self._start = time.monotonic()
         sys.stdout.flush()
@@ -67,6 +70,8 @@ class Running:
                 if memory is not None:
                     limit = _address_space() + memory
                     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+                if largest is not None:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
                 status = work()
             except SystemExit as end:
                 status = end.code if isinstance(end.code, int) else 1

@@ -1,7 +1,6 @@
 """What the operating system refuses, and Parquet files that are more than they seem."""
 
 import ctypes
-import resource
 import shutil
 import signal
 import subprocess
@@ -40,7 +39,7 @@ def limits(inputs: Inputs, job: Job, folder: Path) -> Counter[str]:
     wrong = wrong[: {"tune": 2, "serve": 1, "promote": 0}.get(job.name, 3)]
     for out in wrong:
         expect(f"out is {out.name[:20]}", Running(work(out)))
-    expect("file too large", Running(_with_small_files(work(place / "small" / job.out))), 0)
+    expect("file too large", Running(work(place / "small" / job.out), largest=1000), 0)
     for megabytes in (60, 200, 1000):
         started = Running(work(place / "memory" / job.out), memory=megabytes * 2**20)
         expect(f"{megabytes} MB of memory", started, 0, *_BY_A_LIBRARY)
@@ -60,16 +59,6 @@ def limits(inputs: Inputs, job: Job, folder: Path) -> Counter[str]:
         counts[f"left: {path}"] += 1
     shutil.rmtree(place, ignore_errors=True)
     return counts
-
-
-def _with_small_files(work: Callable[[], int]) -> Callable[[], int]:
-    """The work where no file may have more than 1,000 bytes."""
-
-    def limited() -> int:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-        return work()
-
-    return limited
 
 
 def _mounted(inputs: Inputs, job: Job, disk: Path, options: str) -> Callable[[], int]:

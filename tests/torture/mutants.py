@@ -4,37 +4,29 @@ A mutant is the name of a function or class of ucfrec and what replaces it; noth
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import h5py
-import numpy as np
+import pyarrow.parquet as pq
 
 _JOBS = ("collect", "prepare", "train", "update", "tune", "join", "recommend", "score", "ope")
 _JOBS += ("evaluate", "report", "serve", "promote")
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """A guard, and what is there instead."""
-
-    name: str
-    instead: Any
+Mutant = tuple[str, Any]
 
 
 @contextmanager
 def applied(mutant: Mutant | None) -> Iterator[None]:
     """Forks of this process run the mutant."""
-    with patch(f"ucfrec{mutant.name}", mutant.instead) if mutant else nullcontext():
+    with patch(f"ucfrec{mutant[0]}", mutant[1]) if mutant else nullcontext():
         yield
 
 
 class UnexplainedError(Exception):
-    """What a guard raises that explains nothing."""
+    """Raised where an `InputError` should explain."""
 
 
 @contextmanager
@@ -48,57 +40,38 @@ def _claim_nothing(path: Path, wait: bool = False) -> Iterator[bool]:
     yield True
 
 
-def _skip(*_: object, **__: object) -> None:
-    pass
-
-
-def _explain_nothing(*_: object) -> Any:
-    return nullcontext()
-
-
-def _read_column(path: Path, column: str) -> Any:
-    import pyarrow.parquet as pq
-
-    return np.asarray(pq.read_table(path, columns=[column]).column(column))
-
-
-def _load_weights(_: Path, module: Any, tensors: Any, assign: bool = False) -> None:
-    module.load_state_dict(tensors, assign=assign)
-
-
-def _parse_text(path: Path, _: int, __: str, parse: Callable[[str], Any]) -> Any:
-    return parse(path.read_text())
-
-
 def _read_rule(path: Path) -> Any:
     from ucfrec.acting.decision import DecisionRule
 
-    return DecisionRule(**_read_json(path))
+    return DecisionRule(**json.loads(path.read_text()))
 
 
-def _read_json(path: Path) -> Any:
-    return json.loads(path.read_text())
-
-
-def _row(value: Any, _: str) -> Any:
+def _make_row(value: Any, _: str) -> Any:
     from ucfrec.results.rows import ResultRow
 
     return ResultRow(**value)
 
 
-_RECORD = Mutant(".files.record._first_fault", lambda error, *_: error)
-_STATES = Mutant(".episodes.states.damage_explained", _explain_nothing)
-_WEIGHTS = Mutant(".fitting.checkpoint.load_weights", _load_weights)
-_LOADED = Mutant(".runs.trained_policy.damage_explained", _explain_nothing)
-_ROW, _TEXT = (
-    Mutant(".results.rows.row_from_json", _row),
-    Mutant(".files.atomic._parse", _parse_text),
+def _explain_nothing(module: str) -> Mutant:
+    return f".{module}.InputError", UnexplainedError
+
+
+def _read_column(path: Path, column: str) -> Any:
+    return pq.read_table(path, columns=[column]).column(column).to_numpy()
+
+
+_RECORD = ".files.record._first_fault", lambda error, *_: error
+_STATES = ".episodes.states.damage_explained", lambda *_: nullcontext()
+_WEIGHTS = (
+    ".fitting.checkpoint.load_weights",
+    lambda _, to, *of, **how: to.load_state_dict(*of, **how),
 )
-_IDS = Mutant(".files.parquet.read_ids", _read_column)
-_COLUMN = Mutant(".episodes.view.InputError", UnexplainedError)
-_ERRORS = Mutant(".logs.engine.explain_errors", _explain_nothing)
-_EXPLAINED = Mutant(".commands.cli.explanation", _skip)
-_READERS = {
+_TEXT = ".files.atomic._parse", lambda path, _, __, parse: parse(path.read_text())
+_ROW, _IDS = (".results.rows.row_from_json", _make_row), (".files.parquet.read_ids", _read_column)
+_COLUMN, _LOG = _explain_nothing("episodes.view"), _explain_nothing("logs.tables")
+_UNCHECKED = ".files.record.Record.require", lambda *_, **__: None
+_EXPLAINED = ".commands.cli.explanation", lambda _: None
+_READERS: dict[str, Mutant] = {
     "meta.json": _RECORD,
     "item_states.safetensors": _STATES,
     "users.parquet": _IDS,
@@ -106,34 +79,37 @@ _READERS = {
     "shard-00000/reward.npy": _COLUMN,
     "shard-00000/offsets.npy": _COLUMN,
     "run: run.json": _RECORD,
-    "run: decision_rule.json": Mutant(".runs.trained_policy.read_rule", _read_rule),
+    "run: decision_rule.json": (".runs.trained_policy.read_rule", _read_rule),
     "run: policy/best.safetensors": _WEIGHTS,
-    "run: items.parquet": Mutant(".runs.trained_policy.read_ids", _read_column),
+    "run: items.parquet": (".runs.trained_policy.read_ids", _read_column),
     "run: reward_model/item_reward.safetensors": _WEIGHTS,
     "run: item_states.safetensors": _STATES,
     "run: training_counts.safetensors": _STATES,
-    "run: training_returns.safetensors": _LOADED,
+    "run: training_returns.safetensors": _explain_nothing("fitting.checkpoint"),
     "report: run.json": _RECORD,
-    "report: samples.json": Mutant(".reporting.training.read_json", _read_json),
-    "last.safetensors alone": Mutant(".fitting.checkpoint.InputError", UnexplainedError),
-    "metrics.jsonl alone": Mutant(".fitting.checkpoint.InputError", UnexplainedError),
-    "items.parquet alone": Mutant(".files.parquet.InputError", UnexplainedError),
+    "report: samples.json": (
+        ".reporting.training.read_json",
+        lambda path: json.loads(path.read_text()),
+    ),
+    "last.safetensors alone": _explain_nothing("fitting.checkpoint"),
+    "metrics.jsonl alone": _explain_nothing("fitting.checkpoint"),
+    "items.parquet alone": _explain_nothing("files.parquet"),
     "rows.jsonl alone": _ROW,
     "evaluations.json alone": _ROW,
     "report: evaluations": _ROW,
     "mapping.toml alone": _TEXT,
     "config.toml alone": _TEXT,
-    "setting.txt alone": Mutant(".runs.config.InputError", UnexplainedError),
-    "log.csv alone": Mutant(".logs.tables.InputError", UnexplainedError),
-    "log.parquet alone": Mutant(".logs.tables.InputError", UnexplainedError),
-    "hopper.hdf5 alone": Mutant("_control.data.d4rl.open_hdf5", h5py.File),
+    "setting.txt alone": _explain_nothing("runs.config"),
+    "log.csv alone": _LOG,
+    "log.parquet alone": _LOG,
+    "hopper.hdf5 alone": ("_control.data.d4rl.open_hdf5", h5py.File),
 }
-_UNCHECKED = Mutant(".files.record.Record.require", _skip)
-MUTANTS = {
-    **{("kills", job): Mutant(".files.atomic._scratch_moved", _write_in_place) for job in _JOBS},
-    ("interruptions", "collect"): Mutant(".files.atomic._remove", _skip),
-    ("pairs", "prepare"): Mutant(".files.atomic.claim", _claim_nothing),
-    **{("flips", folder): _UNCHECKED for folder in ("store", "run")},
+MUTANTS: dict[tuple[str, str], Mutant] = {
+    **{("kills", job): (".files.atomic._scratch_moved", _write_in_place) for job in _JOBS},
+    ("interruptions", "collect"): (".files.atomic._remove", lambda _: None),
+    ("pairs", "prepare"): (".files.atomic.claim", _claim_nothing),
+    ("flips", "store"): _UNCHECKED,
+    ("flips", "run"): _UNCHECKED,
     **{("fuzz", reader): mutant for reader, mutant in _READERS.items()},
     **{("limits", job): _EXPLAINED for job in _JOBS},
     ("hostile Parquet", "prepare"): _EXPLAINED,

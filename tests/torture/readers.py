@@ -67,10 +67,6 @@ class Reader:
         return _run_batches(partial(_flip_batch, self, folder / "flips", seed), folder, cases)
 
 
-class HungError(Exception):
-    """A reader took too long."""
-
-
 def _run_batches(work: Callable[[range], Counter[str]], folder: Path, cases: int) -> Counter[str]:
     """The counts of `work` for so many cases, in processes of their own."""
     counts, answer = Counter[str](), folder / "counts.json"
@@ -120,7 +116,7 @@ def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range) -> Count
 
 
 def _raise_hung(*_: object) -> None:
-    raise HungError
+    raise TimeoutError
 
 
 def _read(reader: Reader, place: Path) -> tuple[str, Any]:
@@ -132,8 +128,6 @@ def _read(reader: Reader, place: Path) -> tuple[str, Any]:
         return "harmless", reader.read(place)
     except InputError as error:
         return "found" if str(error).isprintable() else "not one printable line", str(error)
-    except HungError:
-        return "hung", None
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
             return "found", str(error)  # a name that the file gives; commands explain it

@@ -130,11 +130,11 @@ def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
     the warm-up; what it does not learn from, such as how often it is validated, is the budget's.
     """
     if name.startswith(PAPER_UCF):
-        given = dict(setting.split("=", 1) for setting in budget.settings)
-        steps = int(given.get("train.steps", PRESET_STEPS))
+        values = dict(setting.split("=", 1) for setting in budget.settings)
+        steps = int(values.get("train.steps", PRESET_STEPS))
         warmup, every = PRESET_WARMUP * steps // PRESET_STEPS, "train.validate_every"
         shorter = (f"train.steps={steps}", f"train.warmup_steps={warmup}")
-        rarely = (f"{every}={given[every]}",) if every in given else ()
+        rarely = (f"{every}={values[every]}",) if every in values else ()
         return (*shorter, *rarely, *method.settings, *budget.of_methods.get(name, ()))
     policy_settings = budget.of_policies.get(method.policy, ())
     rate = _rate_of(budget, method)

@@ -85,12 +85,12 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
     arguments, batch = _draw_windows(graph, trained, 3), torch.export.Dim("batch", min=1, max=2**20)
     with atomic_folder(out) as scratch:
         runner, difference = _write_graph(graph, arguments, scratch / GRAPH, batch), 0.0
-        read = {entry.name for entry in runner.get_inputs()}
+        input_names = {entry.name for entry in runner.get_inputs()}
         for count in (_COMPARED, 1):
             arguments = _draw_windows(graph, trained, count)
             with torch.no_grad():
                 expected = graph(**arguments).numpy()
-            fed = {name: value.numpy() for name, value in arguments.items() if name in read}
+            fed = {name: value.numpy() for name, value in arguments.items() if name in input_names}
             (action,) = runner.run(None, fed)
             size = max(float(np.abs(expected).max()), 1e-6)
             difference = max(difference, float(np.abs(action - expected).max()) / size)
@@ -103,7 +103,7 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
             "inputs": {
                 name: {"shape": ["batch", *value.shape[1:]], "meaning": _MEANINGS[name]}
                 for name, value in arguments.items()
-                if name in read
+                if name in input_names
             },
             "outputs": {"action": {"shape": ["batch", *expected.shape[1:]]}},
             "context": trained.policy.config.context,
@@ -150,8 +150,8 @@ def _draw_windows(graph: WindowGraph, trained: TrainedPolicy, count: int) -> dic
     """Random inputs of a graph, in the order of its arguments."""
     rng, policy, k = np.random.default_rng(count), graph.policy, graph.policy.config.context
     observations = torch.zeros(count, k, trained.logged_observation_size)
-    drawn = torch.from_numpy(rng.normal(size=(count, k, len(policy.state_mean)))).float()
-    observations[..., graph.get_buffer("seen")] = drawn * policy.state_std + policy.state_mean
+    noise = torch.from_numpy(rng.normal(size=(count, k, len(policy.state_mean)))).float()
+    observations[..., graph.get_buffer("seen")] = noise * policy.state_std + policy.state_mean
     actions = rng.uniform(-1, 1, (count, k, trained.record.sizes["action"]))
     return {
         "observations": observations,

@@ -103,12 +103,15 @@ def estimate(
     apart = np.square(chosen - logged).mean(axis=0)[variance > 0]
     distance = float((apart / variance[variance > 0]).mean()) if len(apart) else 0.0
     of_behaviour, of_policy = model.fit(logged), model.fit(chosen)
-    settled, few = of_policy.settled and of_behaviour.settled, len(store.lengths) < _GROUPS
+    converged, has_few = (
+        of_policy.converged and of_behaviour.converged,
+        len(store.lengths) < _GROUPS,
+    )
     returns, half, value = model.logged_returns(of_behaviour.weights), 0.0, of_policy.value
     reasons = []
-    if not settled:
+    if not converged:
         reasons.append("the regressions did not settle")
-    if few:
+    if has_few:
         reasons.append(f"of fewer than {_GROUPS} trajectories there is no interval")
     else:
         half = of_policy.half_width
@@ -118,19 +121,19 @@ def estimate(
             f"at most {_FAR:g}), so the log does not show what they lead to"
         )
     mean, spread = float(returns.mean()), float(returns.std())
-    allowed = _BIASED * spread + (0.0 if few else of_behaviour.half_width)
-    if settled and abs(of_behaviour.value - mean) > allowed:
+    allowed = _BIASED * spread + (0.0 if has_few else of_behaviour.half_width)
+    if converged and abs(of_behaviour.value - mean) > allowed:
         reasons.append(
             f"the same method says {of_behaviour.value:.4g} of the behaviour, which returned "
             f"{mean:.4g}"
         )
-    if settled and not returns.min() <= value <= returns.max():
+    if converged and not returns.min() <= value <= returns.max():
         reasons.append(
             f"the value is outside of what was logged ({returns.min():.4g} to {returns.max():.4g})"
         )
     return Estimate(
-        value=value if settled else None,
-        interval=(value - half, value + half) if settled and not few else None,
+        value=value if converged else None,
+        interval=(value - half, value + half) if converged and not has_few else None,
         behaviour=mean,
         best_quarter=float(np.sort(returns)[-max(1, len(returns) // 4) :].mean()),
         reasons=tuple(reasons),
@@ -143,7 +146,7 @@ class _Fit:
     value: float
     half_width: float
     """Of the 95% interval; infinite of fewer trajectories than groups."""
-    settled: bool
+    converged: bool
 
 
 class _Model:
@@ -174,31 +177,31 @@ class _Model:
         """Q of a policy with the actions `chosen` (N, A) at all steps."""
         sums = [self._sum(group, chosen) for group in range(self._groups)]
         total = [np.sum(parts, axis=0) for parts in zip(*sums, strict=True)]
-        weights, value, settled = self._solve(total)
+        weights, value, converged = self._solve(total)
         if self._groups < _GROUPS:
-            return _Fit(weights, value, np.inf, settled)
+            return _Fit(weights, value, np.inf, converged)
         without = [
             self._solve([whole - part for whole, part in zip(total, parts, strict=True)])
             for parts in sums
         ]
         values = np.array([value for _, value, _ in without])
         spread = np.sqrt((_GROUPS - 1) * values.var())
-        settled = settled and all(ended for *_, ended in without)
-        return _Fit(weights, value, float(student.ppf(0.975, _GROUPS - 1) * spread), settled)
+        converged = converged and all(ended for *_, ended in without)
+        return _Fit(weights, value, float(student.ppf(0.975, _GROUPS - 1) * spread), converged)
 
     def _sum(self, group: int, chosen: Array) -> tuple[Array, ...]:
         """Σ φφᵀ, Σ φφ'ᵀ, Σ φr, Σ φ of first steps, and their number, of a group of trajectories."""
         mine = np.arange(len(self._lengths)) % self._groups == group
-        known = np.repeat(mine, self._lengths)
-        known[self._ends[self._cut]] = False
-        ends, rows = np.zeros(len(known), dtype=bool), np.flatnonzero(known)
+        is_row = np.repeat(mine, self._lengths)
+        is_row[self._ends[self._cut]] = False
+        ends, rows = np.zeros(len(is_row), dtype=bool), np.flatnonzero(is_row)
         ends[self._ends] = True
         first = self._features(self._starts[mine], chosen).sum(0)
         squares, products = np.zeros((2, len(first), len(first)))
         rewards = np.zeros(len(first))
         for part in np.array_split(rows, -(-len(rows) // _BATCH) or 1):
             now = self._features(part, self._logged)
-            later = self._features(np.minimum(part + 1, len(known) - 1), chosen)
+            later = self._features(np.minimum(part + 1, len(is_row) - 1), chosen)
             later[ends[part]] = 0.0
             squares += now.T @ now
             products += now.T @ later
@@ -206,19 +209,19 @@ class _Model:
         return squares, products, rewards, first, np.array(mine.sum())
 
     def _solve(self, sums: list[Array]) -> tuple[Float64Array, float, bool]:
-        """Weights, mean value of the first steps, and whether the regressions settled."""
+        """Weights, mean value of the first steps, and whether the regressions converged."""
         squares, products, rewards, first, count = sums
         ridge = _RIDGE * np.trace(squares) / len(squares) * np.eye(len(squares))
         solved = np.linalg.solve(squares + ridge, np.column_stack([rewards, products]))
         weights, matrix = solved[:, 0], self._discount * solved[:, 1:]
-        size, settled = np.abs(weights).max(), False
+        size, converged = np.abs(weights).max(), False
         for _ in range(_DOUBLINGS):  # w + M w + … + Mⁿ w of n = 1, 3, 7, … regressions
             change = matrix @ weights
             weights, matrix = weights + change, matrix @ matrix
-            settled = bool(np.abs(change).max() <= 1e-6 * np.abs(weights).max())
-            if settled or np.abs(change).max() > 1e9 * size:
+            converged = bool(np.abs(change).max() <= 1e-6 * np.abs(weights).max())
+            if converged or np.abs(change).max() > 1e9 * size:
                 break
-        return weights, float(first @ weights / count), settled
+        return weights, float(first @ weights / count), converged
 
     def logged_returns(self, weights: Float64Array) -> Float64Array:
         """Discounted returns (E,) of the logged trajectories; where the step limit cut one, its

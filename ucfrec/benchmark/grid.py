@@ -64,8 +64,7 @@ def run_grid(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
     )
     if missing:
-        measure = partial(_measure, how.measure, results)
-        calls = {name: partial(measure, *tasks[name]) for name in missing}
+        calls = {name: partial(_measure, how.measure, results, *tasks[name]) for name in missing}
         rows |= _measure_all(calls, workers, describe)
     return [row for group in rows.values() for row in group]
 
@@ -103,14 +102,14 @@ def _measure_all(
 
     with progress(len(calls), describe, "cells") as bar:
         if workers > 1:
-            with pool_of_processes(workers, _use_one_thread) as pool:
+            with pool_of_processes(workers, partial(torch.set_num_threads, 1)) as pool:
                 with block_ctrl_c():
                     keys = {pool.submit(call): key for key, call in calls.items()}
                 for done in as_completed(keys):
                     collect(keys[done], done.result)
         else:
             threads = torch.get_num_threads()
-            _use_one_thread()
+            torch.set_num_threads(1)
             try:
                 for key, call in calls.items():
                     collect(key, call)
@@ -122,12 +121,6 @@ def _measure_all(
             f"first: {errors[0]}"
         )
     return rows
-
-
-def _use_one_thread() -> None:
-    import torch
-
-    torch.set_num_threads(1)
 
 
 def select_names(names: Iterable[str], selected: Sequence[str], what: str) -> list[str]:

@@ -150,10 +150,7 @@ class ResultRow(RowKey):
 
     def to_json(self) -> dict[str, Any]:
         """The row as JSON values, without fields at their default."""
-        written = {name: v for name, v in vars(self).items() if v not in (None, "", {})}
-        if self.interval is not None:
-            written["interval"] = list(self.interval)
-        return written
+        return {name: value for name, value in vars(self).items() if value not in (None, "", {})}
 
 
 _NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
@@ -170,15 +167,15 @@ def row_from_json(
     """
     try:
         row = validate(value)
-        fault = "" if row.metric in row.metrics else f"its metrics lack {row.metric!r:.60}"
+        if row.metric in row.metrics:
+            return row
+        fault = f"its metrics lack {row.metric!r:.60}"
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         fault = f"{'.'.join(map(str, first['loc']))!r:.60}: {first['msg']}"
     except RecursionError:
         fault = "it is nested too deeply"
-    if fault:
-        raise InputError(f"{where} is not a result row: {fault}; delete it, or name another file")
-    return row
+    raise InputError(f"{where} is not a result row: {fault}; delete it, or name another file")
 
 
 def read_rows(path: Path) -> list[ResultRow]:
@@ -187,10 +184,9 @@ def read_rows(path: Path) -> list[ResultRow]:
     Raises:
         InputError: a line is not a result row, or the file is not UTF-8 text.
     """
-    lines = enumerate(_read_text(path).split("\n"), start=1)
     return [
         row_from_json(line, f"{path}, line {number}", _ROWS.validate_json)
-        for number, line in lines
+        for number, line in enumerate(_read_text(path).split("\n"), start=1)
         if line.strip()
     ]
 
@@ -201,12 +197,8 @@ def read_results(path: Path) -> list[ResultRow]:
     Raises:
         InputError: the file is missing or has other content.
     """
-    if path.suffix != ".json":
-        if not path.exists():
-            raise InputError(f"{path} does not exist; check the path")
-        with path.open("rb") as file:
-            if file.read(1) != b"[":
-                return read_rows(path)
+    if path.suffix != ".json" and path.exists() and not _read_text(path).startswith("["):
+        return read_rows(path)
     rows = atomic.read_json(path)
     if not isinstance(rows, list):
         raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
@@ -307,9 +299,7 @@ class ResultTable:
 
         lines = []
         for row in self.rows:
-            intervals = {**row.details.get("intervals", {})}
-            if row.interval is not None:
-                intervals[row.metric] = row.interval
+            intervals = {row.metric: row.interval, **row.details.get("intervals", {})}
             line: dict[str, Any] = {"method": row.method}
             for name, value in row.metrics.items():
                 line[name] = value

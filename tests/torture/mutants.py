@@ -80,10 +80,10 @@ def _read_json(path: Path) -> Any:
     return json.loads(path.read_text())
 
 
-def _row(value: Any, _: str) -> Any:
+def _row(text: str, _: str) -> Any:
     from ucfrec.results.rows import ResultRow
 
-    return ResultRow(**value)
+    return ResultRow(**json.loads(text))
 
 
 _RECORD = Mutant(".files.record._first_fault", lambda error, *_: error)

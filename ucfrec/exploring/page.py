@@ -10,8 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from fastapi import FastAPI, Request, Response
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -213,33 +217,26 @@ def _read_number(
     return value
 
 
-def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
+def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> Starlette:
     """The application, which answers the given values of `Host` and keeps no state of visitors."""
-    app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
 
-    def html(text: str) -> Response:
+    def answer(text: str, kind: str = "html") -> Response:
         # Texts of files may have bytes that are not valid Unicode.
         content = text.encode("utf-8", errors="backslashreplace")
-        return Response(content, media_type="text/html; charset=utf-8", headers=_HEADERS)
+        return Response(content, headers=_HEADERS, media_type=f"text/{kind}; charset=utf-8")
 
-    @app.get("/")
-    def page(request: Request) -> Response:
-        return html(explorer.page(request.query_params))
-
-    @app.get("/results")
-    def results(request: Request) -> Response:
-        return html(explorer.results(request.query_params))
-
-    @app.get("/explore.js")
-    def javascript() -> Response:
-        return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
-
-    @app.get("/report/{number}")
-    def report(number: int) -> Response:
-        if not 0 <= number < len(explorer.runs):
+    def report(request: Request) -> Response:
+        number = request.path_params["number"]
+        if number >= len(explorer.runs):
             return Response("there is no such run", 404)
-        return html(explorer.reports[number])
+        return answer(explorer.reports[number])
 
-    return app
+    routes = [
+        Route("/", lambda request: answer(explorer.page(request.query_params))),
+        Route("/results", lambda request: answer(explorer.results(request.query_params))),
+        Route("/explore.js", lambda _: answer(script, "javascript")),
+        Route("/report/{number:int}", report),
+    ]
+    hosts = Middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
+    return Starlette(routes=routes, middleware=[hosts])

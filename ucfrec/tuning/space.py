@@ -3,16 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
+
+from optuna import Trial
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import TABLES, Config, resolve_config
-
-if TYPE_CHECKING:
-    from optuna import Trial
 
 POLICY: Final = "policy"
 """Name of the choice among policies; settings have a dot."""
@@ -43,7 +42,7 @@ class Dimension:
                 "true"
             )
 
-    def suggest(self, trial: "Trial", name: str) -> Value:
+    def suggest(self, trial: Trial, name: str) -> Value:
         """The value of this setting in a trial."""
         if self.choices:
             return cast(Value, trial.suggest_categorical(name, self.choices))
@@ -159,7 +158,7 @@ class Search:
             config = replace(config, train=shorter)
         return config
 
-    def suggest(self, trial: "Trial") -> tuple[str, dict[str, Value]]:
+    def suggest(self, trial: Trial) -> tuple[str, dict[str, Value]]:
         """The policy and settings of a trial."""
         policy = self.policies[0]
         if len(self.policies) > 1:

@@ -12,10 +12,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import optuna
 import torch
+from optuna import Study, Trial, TrialPruned
+from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
@@ -31,10 +35,6 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
-
-if TYPE_CHECKING:
-    from optuna import Study, Trial
-    from optuna.trial import FrozenTrial
 
 VALUE: Final = "value"
 METRICS: Final = {
@@ -96,7 +96,7 @@ class Plan:
     """Whether trials are ended early whose validation loss is above the median of the others'."""
 
 
-def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
+def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
@@ -138,12 +138,12 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     return study
 
 
-def list_finished(study: "Study") -> "list[FrozenTrial]":
+def list_finished(study: Study) -> list[FrozenTrial]:
     """The trials that were measured or ended early."""
     return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
 
-def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
+def config_of(plan: Plan, trial: FrozenTrial) -> Config:
     """The configuration of a trial."""
     values = dict(trial.params)
     policy = values.pop(POLICY, plan.search.policies[0])
@@ -151,16 +151,13 @@ def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
 
 
 @contextmanager
-def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
+def _open_study(folder: Path, seed: int = 0) -> Iterator[Study]:
     """The study of a folder, new if it has none, while it is used; errors of its file become an
     `InputError`.
 
     Args:
         seed: of what its trials draw.
     """
-    import optuna
-    from sqlalchemy.exc import SQLAlchemyError
-
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     folder.mkdir(parents=True, exist_ok=True)
@@ -186,7 +183,7 @@ def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
         ) from None
 
 
-def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
+def _require_same(study: Study, plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
     own: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
@@ -209,10 +206,8 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
         )
 
 
-def _enqueue_again(study: "Study") -> None:
+def _enqueue_again(study: Study) -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
-    from optuna.trial import TrialState
-
     for trial in study.trials:
         if trial.state == TrialState.RUNNING:
             study.tell(trial.number, state=TrialState.FAIL)
@@ -222,9 +217,6 @@ def _enqueue_again(study: "Study") -> None:
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
-    from optuna import TrialPruned
-    from optuna.trial import TrialState
-
     store = EpisodeStore.open(plan.store)
     # With the seed of the search, one that goes on would draw the first points once more.
     with _open_study(plan.out, seed) as study:
@@ -239,9 +231,8 @@ def _run_trials(plan: Plan, count: int, seed: int) -> None:
                 study.tell(trial, state=TrialState.FAIL)
 
 
-def _measure_trial(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
+def _measure_trial(plan: Plan, store: EpisodeStore, trial: Trial) -> float:
     """The metric of a trial, whose run is deleted unless it is the best."""
-    from optuna import TrialPruned
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
         if plan.prune and "validation_loss" in logged:
@@ -270,13 +261,13 @@ def _name_run(plan: Plan, config: Config) -> Path:
     return plan.out / f"{TRIAL}{config_hash(asdict(config))}"
 
 
-def _list_values(study: "Study") -> list[float]:
+def _list_values(study: Study) -> list[float]:
     """The metric of each trial that was measured."""
     trials = (trial for trial in study.trials if trial.state.name == "COMPLETE")
     return [trial.value for trial in trials if trial.value is not None]
 
 
-def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
+def _is_hopeless(study: Study, number: int, policy: str) -> bool:
     """Whether its loss is above the median of earlier trials of its policy at that step."""
     trials = study.get_trials(deepcopy=False)
     curve = trials[number].intermediate_values
@@ -292,7 +283,7 @@ def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
     return len(losses) >= _COMPARED and curve[step] > float(np.median(losses))
 
 
-def _keep_best(study: "Study", plan: Plan) -> None:
+def _keep_best(study: Study, plan: Plan) -> None:
     """Move the best run to its place and delete those of the other trials."""
     if not _list_values(study):
         errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
@@ -306,11 +297,9 @@ def _keep_best(study: "Study", plan: Plan) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def importances(study: "Study") -> dict[str, float]:
+def importances(study: Study) -> dict[str, float]:
     """Share of the metric's variance that each setting of all trials explains (fANOVA: Hutter et
     al., ICML 2014), most important first; empty with fewer than four trials that differ."""
-    import optuna
-
     if len(set(_list_values(study))) < 4:
         return {}
     try:
@@ -320,7 +309,7 @@ def importances(study: "Study") -> dict[str, float]:
         return {}
 
 
-def _write_report(study: "Study", plan: Plan) -> None:
+def _write_report(study: Study, plan: Plan) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
     config, file = config_of(plan, study.best_trial), plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
@@ -357,7 +346,7 @@ def _write_report(study: "Study", plan: Plan) -> None:
         scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def _tabulate_trials(study: "Study", metric: str) -> str:
+def _tabulate_trials(study: Study, metric: str) -> str:
     """The trials, best first; those without a value last."""
     trials = [trial for trial in study.trials if trial.state.is_finished()]
     trials.sort(key=lambda t: (t.state.name != "COMPLETE", -(t.value or 0.0)))

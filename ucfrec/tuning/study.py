@@ -133,21 +133,13 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
                 with block_ctrl_c():
                     results = pool.map(partial(_run_trials, plan), shares, seeds)
                 list(results)
-        _keep_best(study, plan)
-        _write_report(study, plan)
+        _write_report(study, plan, _keep_best(study, plan))
     return study
 
 
 def list_finished(study: Study) -> list[FrozenTrial]:
     """The trials that were measured or ended early."""
     return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-
-
-def config_of(plan: Plan, trial: FrozenTrial) -> Config:
-    """The configuration of a trial."""
-    values = dict(trial.params)
-    policy = values.pop(POLICY, plan.search.policies[0])
-    return plan.search.config(policy, values)
 
 
 @contextmanager
@@ -235,10 +227,18 @@ def _measure_trial(plan: Plan, store: EpisodeStore, trial: Trial) -> float:
     """The metric of a trial, whose run is deleted unless it is the best."""
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
-        if plan.prune and "validation_loss" in logged:
-            trial.report(logged["validation_loss"], step)
-            if _is_hopeless(trial.study, trial.number, policy):
-                raise TrialPruned
+        """End the trial where its loss is above the median of the others of its policy, as losses
+        of different policies are not of the same quantity."""
+        if not plan.prune or (loss := logged.get("validation_loss")) is None:
+            return
+        losses = [
+            earlier.intermediate_values[step]
+            for earlier in trial.study.get_trials(deepcopy=False)
+            if earlier.user_attrs.get(POLICY) == policy and step in earlier.intermediate_values
+        ]
+        trial.report(loss, step)
+        if len(losses) >= _COMPARED and loss > np.median(losses):
+            raise TrialPruned
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
@@ -267,34 +267,21 @@ def _list_values(study: Study) -> list[float]:
     return [trial.value for trial in trials if trial.value is not None]
 
 
-def _is_hopeless(study: Study, number: int, policy: str) -> bool:
-    """Whether its loss is above the median of earlier trials of its policy at that step."""
-    trials = study.get_trials(deepcopy=False)
-    curve = trials[number].intermediate_values
-    step = max(curve)
-    # Losses of different policies are not of the same quantity.
-    losses = [
-        trial.intermediate_values[step]
-        for trial in trials
-        if trial.number != number
-        and trial.user_attrs.get(POLICY) == policy
-        and step in trial.intermediate_values
-    ]
-    return len(losses) >= _COMPARED and curve[step] > float(np.median(losses))
-
-
-def _keep_best(study: Study, plan: Plan) -> None:
-    """Move the best run to its place and delete those of the other trials."""
+def _keep_best(study: Study, plan: Plan) -> Config:
+    """Move the best run to its place and delete the others; returns its configuration."""
     if not _list_values(study):
         errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
-    run = _name_run(plan, config_of(plan, study.best_trial))
+    values = study.best_params
+    config = plan.search.config(values.pop(POLICY, plan.search.policies[0]), values)
+    run = _name_run(plan, config)
     if run.is_dir():
         shutil.rmtree(plan.out / BEST, ignore_errors=True)
         run.rename(plan.out / BEST)
     for folder in plan.out.glob(f"{TRIAL}*"):
         shutil.rmtree(folder, ignore_errors=True)
+    return config
 
 
 def importances(study: Study) -> dict[str, float]:
@@ -309,9 +296,9 @@ def importances(study: Study) -> dict[str, float]:
         return {}
 
 
-def _write_report(study: Study, plan: Plan) -> None:
+def _write_report(study: Study, plan: Plan, config: Config) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
-    config, file = config_of(plan, study.best_trial), plan.out / BEST_TOML
+    file = plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
     if "train.steps" in names:
         names.add("train.warmup_steps")

@@ -116,8 +116,7 @@ class Budget:
 
     def seeds_of(self, task: str, method: str) -> int:
         """The number of training seeds of a method on a task."""
-        fewest = min(self.fewer_seeds.get(name, self.seeds) for name in (task, method))
-        return min(self.seeds, fewest)
+        return min(self.seeds, *(self.fewer_seeds.get(name, self.seeds) for name in (task, method)))
 
     def narrow(
         self,

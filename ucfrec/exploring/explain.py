@@ -102,12 +102,11 @@ def read_pasted(text: str) -> pd.DataFrame:
             rewards.append(float(reward) if comma else 0.0)
         except ValueError:
             rewards.append(np.nan)
-        if not np.isfinite(rewards[-1]) or abs(rewards[-1]) > schema.LARGEST_REWARD:
+        if not abs(rewards[-1]) <= schema.LARGEST_REWARD:
             raise InputError(
                 f"line {number} of the history is {line[:60]!r}; write item_id, or item_id, reward"
             )
-    now = int(time.time() * 1000)
-    times = now - 60_000 * np.arange(len(items), 0, -1)
+    times = int(time.time() * 1000) - 60_000 * np.arange(len(items), 0, -1)
     frame = pd.DataFrame({schema.USER_ID: "pasted", schema.ITEM_ID: items})
     return frame.assign(timestamp=times, session_id=0, reward=rewards)
 

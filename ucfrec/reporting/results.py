@@ -74,12 +74,11 @@ def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
     steps = [row for row in group if row.metric == _STEP]
     rows = [row for row in group if row.metric != _STEP]
     first = next((row for row in rows if row.method != LOGGED), group[0])
-    name, conditions = first.policy, first.conditions
+    name, choice, run = first.policy, first.conditions.get("choice"), first.conditions.get("run")
     if first.details.get("selection") is not None:
         name += f" ({first.details.get('candidate')})"
     else:
-        name += f" ({conditions['choice']})" if conditions.get("choice") is not None else ""
-        name += f" of {conditions['run']}" if conditions.get("run") is not None else ""
+        name += ("" if choice is None else f" ({choice})") + ("" if run is None else f" of {run}")
     warnings = (row.details.get("warnings") for row in group)
     texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
     return Estimates(name, rows, tuple(dict.fromkeys(texts)), steps)
@@ -87,8 +86,7 @@ def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
 
 def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
     """The row that the verdict is of, if it has an interval."""
-    quoted = (row for row in rows if row.interval and row.method == row.details.get("verdict_of"))
-    return next(quoted, None)
+    return next((r for r in rows if r.interval and r.method == r.details.get("verdict_of")), None)
 
 
 def draw_environments(environments: Environments) -> list[tuple[Chart, Table]]:
@@ -162,8 +160,7 @@ def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
     intervals, logged = [], set()
     for estimates in all_estimates:
         logged |= {row.value for row in estimates.rows if row.method == LOGGED}
-        row = find_quoted(estimates.rows)
-        if row is not None and row.interval is not None:
+        if (row := find_quoted(estimates.rows)) and row.interval:
             name, reliable = f"{estimates.name}: {row.method}", row.details.get("reliable") is True
             intervals.append(Interval(name, row.value, *row.interval, reliable))
     if not intervals:

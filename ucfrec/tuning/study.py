@@ -44,7 +44,10 @@ METRICS: Final = {
     "validation rows",
 }
 _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
-_OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
+_NO_VALUE: Final = (
+    "has no estimated value, because its decision rule is not selected in simulated sessions; use "
+    "--metric ndcg or gauc"
+)
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
 _REMEDY: Final = "restore it, or name another folder"
@@ -61,10 +64,7 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
     if metric == VALUE:
         rule = trained.record.rule
         if rule is None or rule.estimate is None:
-            raise InputError(
-                "the decision rule of this training is not selected in simulated sessions, so "
-                f"there is no estimated value; {_OTHER_METRICS}"
-            )
+            raise InputError(f"this training {_NO_VALUE}")
         return rule.estimate.value
     validation = store.split("validation")
     users = validation.episode_values(schema.USER)
@@ -114,10 +114,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
         config = plan.search.config(policy, {})
         returns = config.policy.returns(store.record.source.session_by)
         if not (store.has_items and config.rule.choose and returns.per_session):
-            raise InputError(
-                f"{store.path}: {policy} has no estimated value there, because its decision rule "
-                f"is not selected in simulated sessions; {_OTHER_METRICS}"
-            )
+            raise InputError(f"{store.path}: {policy} {_NO_VALUE}")
     with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
         with damage_explained(plan.out / STUDY, _REMEDY):
             _require_same(study, plan, store)

@@ -49,16 +49,15 @@ def run_grid(
         tasks.setdefault(str(key), (key, cell))
     if again:
         remove_rows(results, [key for key, _ in tasks.values()])
-        for _, cell in tasks.values():
-            for folder in (cell.run, cell.shared):
-                if folder is not None:
-                    shutil.rmtree(folder, ignore_errors=True)
+        for folder in {folder for _, cell in tasks.values() for folder in (cell.run, cell.shared)}:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
     earlier = read_rows(results)
     rows = {name: [r for r in earlier if key.covers(r)] for name, (key, _) in tasks.items()}
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
     missing = sorted(
         (name for name in tasks if not rows[name]),
-        key=lambda name: -1 if (seed := tasks[name][0].training_seed) is None else seed,
+        key=lambda name: tasks[name][0].training_seed or 0,
     )
     print(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr

@@ -17,7 +17,7 @@ from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.provenance import config_hash, shorten_paths
-from ucfrec.reporting.tables import Table, markdown_table
+from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
@@ -224,9 +224,8 @@ def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _tabulate(rows: Mapping[str, object]) -> str:
-    present = {name: value for name, value in rows.items() if value is not None}
-    body = Table.of_columns("", {"value": present}).rows
-    return markdown_table(["what", "value"], [(name, *cells) for name, cells in body])
+    body = [(name, format_value(value)) for name, value in rows.items() if value is not None]
+    return markdown_table(["what", "value"], body)
 
 
 def describe_user_model(record: RunRecord) -> dict[str, object]:

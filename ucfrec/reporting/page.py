@@ -68,8 +68,7 @@ class _Run:
     @property
     def references(self) -> Mapping[str, float]:
         """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
-        losses = self.record.reference_losses
-        return losses if losses and "action_loss" in self.logged else {}
+        return (self.record.reference_losses or {}) if "action_loss" in self.logged else {}
 
 
 def write_report(
@@ -138,10 +137,10 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
     paths = dict.fromkeys(folder.resolve() for folder in folders)
     common = os.path.commonpath([path.parent for path in paths]) if paths else ""
     for path in paths:
-        record = read_record(path)
+        record, stage = read_record(path), path / AUGMENTATION
         augmentation = record.augmentation
-        if augmentation is None and (path / AUGMENTATION).exists():
-            augmentation = read_augmentation(path / AUGMENTATION)
+        if augmentation is None and stage.exists():
+            augmentation = read_augmentation(stage)
         logged = select_curves(read_metrics(path / "policy"), record.settings)
         runs.append(_Run(path, str(path.relative_to(common)), record, augmentation, logged))
     return runs

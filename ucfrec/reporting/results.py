@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import COLUMNS
@@ -205,19 +204,6 @@ NO_RESULTS = (
 )
 
 
-class _Return(NamedTuple):
-    """Return of one policy in one environment, over all its rows."""
-
-    text: str
-    trainings: int
-    """Number of distinct training seeds; 0 for a built-in policy."""
-    value: float
-    """Mean R_cum over rows."""
-    low: float
-    high: float
-    """Lowest and highest end of the rows' 95% intervals."""
-
-
 _VERDICTS = {1: "Higher", -1: "Lower", 0: "Open, as intervals overlap"}
 
 
@@ -227,8 +213,9 @@ def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> 
     return conclusions + [_quote(estimates) for estimates in all_estimates] or [NO_RESULTS]
 
 
-def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
-    """One summary per policy and checkpoint, trained and high ones first."""
+def _collect_returns(rows: Sequence[ResultRow]) -> list[tuple[int, Interval]]:
+    """Number of training seeds, 0 for a built-in policy, with mean R_cum and ends of all intervals,
+    of each policy and checkpoint; trained and high ones first."""
     groups = grouped(rows, lambda row: (row.method, row.checkpoint))
     policies, returns = [policy for policy, _ in groups], []
     for (policy, checkpoint), group in groups.items():
@@ -236,31 +223,29 @@ def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
         trainings = len({row.training_seed for row in group} - {None})
         value = summary(row.value for row in group).mean
         lows, highs = zip(*(row.interval for row in group if row.interval), strict=True)
-        text = f"{name} ({format_value(value)})"
-        returns.append(_Return(text, trainings, value, min(lows), max(highs)))
-    return sorted(returns, key=lambda of_policy: (not of_policy.trainings, -of_policy.value))
+        name += f" ({format_value(value)})"
+        returns.append((trainings, Interval(name, value, min(lows), max(highs))))
+    return sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
 
 
 def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
     """The best trained policy, and how the others compare: all intervals with all intervals."""
-    returns = _collect_returns(rows)
-    best, trained = returns[0], sum(policy.trainings > 0 for policy in returns)
-    if not trained:
-        names = ", ".join(policy.text for policy in returns)
+    (trainings, best), *returns = _collect_returns(rows)
+    built_in = sum(not seeds for seeds, _ in returns)
+    if not trainings:
+        names = ", ".join(policy.name for policy in (best, *(policy for _, policy in returns)))
         return f"In {environment}, only built-in policies were evaluated: {names}."
     text = (
-        f"In {environment}, {best.text} has the highest return per episode of {trained} trained "
-        f"(95% intervals {format_value(best.low)} to {format_value(best.high)}; trainings: "
-        f"{best.trainings})."
+        f"In {environment}, {best.name} has the highest return per episode of "
+        f"{len(returns) + 1 - built_in} trained (95% intervals {format_value(best.low)} to "
+        f"{format_value(best.high)}; trainings: {trainings})."
     )
-    groups = grouped(
-        returns[1:], lambda policy: (policy.low > best.high) - (policy.high < best.low)
-    )
+    groups = grouped(returns, lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low))
     for above, policies in groups.items():
-        text += f" {_VERDICTS[above]}: {', '.join(policy.text for policy in policies)}."
-    if trained == len(returns):
+        text += f" {_VERDICTS[above]}: {', '.join(policy.name for _, policy in policies)}."
+    if not built_in:
         text += " No built-in policy (random, logging or best) was evaluated to compare it with."
-    if best.trainings < 2:
+    if trainings < 2:
         text += " It was trained once; the spread over training seeds is unknown."
     return text
 

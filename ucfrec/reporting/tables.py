@@ -85,10 +85,10 @@ def mean_and_sd(values: Iterable[float]) -> str:
 
 def format_value(value: Any) -> str:
     """Cell text of `value`: floats with four significant digits, a dash if missing or infinite."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return NONE
-    if isinstance(value, float):
+    if isinstance(value, float) and math.isfinite(value):
         return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+    if value is None or isinstance(value, float):
+        return NONE
     return f"{value:,}" if type(value) is int else str(value)
 
 

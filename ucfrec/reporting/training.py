@@ -73,12 +73,10 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
 
 def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
     """The curves to draw: no loss of weight 0, and no total loss that equals a single term."""
-    policy = config["policy"]
-    unused = {loss for loss, weight in _LOSS_WEIGHTS.items() if policy.get(weight) == 0}
-    curves = {name: curve for name, curve in logged.items() if name not in unused}
-    if curves.get("loss") in [curve for name, curve in curves.items() if name != "loss"]:
-        del curves["loss"]
-    return curves
+    weights = config["policy"]
+    curves = {n: curve for n, curve in logged.items() if weights.get(_LOSS_WEIGHTS.get(n)) != 0}
+    total = curves.pop("loss", {})
+    return {**curves, "loss": total} if total and total not in curves.values() else curves
 
 
 def draw_curves(

@@ -136,7 +136,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
 
 def list_finished(study: Study) -> list[FrozenTrial]:
     """The trials that were measured or ended early."""
-    return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+    return study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
 
 
 @contextmanager
@@ -197,11 +197,10 @@ def _require_same(study: Study, plan: Plan, store: EpisodeStore) -> None:
 
 def _enqueue_again(study: Study) -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
-    for trial in study.trials:
-        if trial.state == TrialState.RUNNING:
-            study.tell(trial.number, state=TrialState.FAIL)
-            if trial.params:
-                study.enqueue_trial(trial.params)
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)
+        if trial.params:
+            study.enqueue_trial(trial.params)
 
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
@@ -260,14 +259,13 @@ def _name_run(plan: Plan, config: Config) -> Path:
 
 def _list_values(study: Study) -> list[float]:
     """The metric of each trial that was measured."""
-    trials = (trial for trial in study.trials if trial.state.name == "COMPLETE")
-    return [trial.value for trial in trials if trial.value is not None]
+    return [trial.values[0] for trial in study.get_trials(states=(TrialState.COMPLETE,))]
 
 
 def _keep_best(study: Study, plan: Plan) -> Config:
     """Move the best run to its place and delete the others; returns its configuration."""
     if not _list_values(study):
-        errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
+        errors = (t.user_attrs["error"] for t in study.trials if "error" in t.user_attrs)
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
     values = study.best_params
@@ -302,8 +300,8 @@ def _write_report(study: Study, plan: Plan, config: Config) -> None:
     chosen, tables = asdict(config), dict[str, str]()
     for name in sorted({*plan.search.fixed, *names}):
         table, _, field = name.partition(".")
-        value = chosen[table][field] if name in names else plan.search.fixed[name]
-        tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
+        tables.setdefault(table, f"\n[{table}]\n")
+        tables[table] += f"{field} = {format_toml(chosen[table][field])}\n"
     options = ("--policy", config.policy_name, "--config", str(file), "--out", "RUN")
     command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
     head = (

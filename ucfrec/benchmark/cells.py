@@ -116,7 +116,8 @@ class Budget:
 
     def seeds_of(self, task: str, method: str) -> int:
         """The number of training seeds of a method on a task."""
-        return min(self.seeds, *(self.fewer_seeds.get(name, self.seeds) for name in (task, method)))
+        fewer = self.fewer_seeds
+        return min(self.seeds, fewer.get(task, self.seeds), fewer.get(method, self.seeds))
 
     def narrow(
         self,

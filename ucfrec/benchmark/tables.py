@@ -123,8 +123,8 @@ def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     checkpoint."""
     best: list[ResultRow] = []
     for group in grouped(rows, lambda row: (row.task, row.method, row.checkpoint)).values():
-        targets = grouped(group, lambda row: row.target_return)
-        best += max(targets.values(), key=lambda same: summary(row.value for row in same).mean)
+        targets = grouped(group, lambda row: row.target_return).values()
+        best += max(targets, key=lambda same: summary(row.value for row in same).mean)
     return best
 
 

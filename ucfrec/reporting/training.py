@@ -191,8 +191,8 @@ def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = Fals
         InputError: the file cannot be read as that or lacks the column.
     """
     require_file(path, "name another file")
-    mapped = (log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID for log in logs)
-    names = dict.fromkeys((schema.ITEM_ID, *(name.strip('"') for name in mapped)))
+    mapped = ((log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID).strip('"') for log in logs)
+    names = dict.fromkeys((schema.ITEM_ID, *mapped))
     try:
         texts = dict.fromkeys(names, pa.string()) if text_ids else None
         types = csv.ConvertOptions(column_types=texts)
@@ -202,8 +202,8 @@ def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = Fals
         raise InputError(f"{path} cannot be read as Parquet or CSV: {error}") from None
     column = next((name for name in names if name in table.column_names), None)
     if column is None:
-        wanted = " or ".join(map(repr, names))
-        raise InputError(f"{path} has no column {wanted}; add one with the item ids")
+        heads = " or ".join(map(repr, names))
+        raise InputError(f"{path} has no column {heads}; add one with the item ids")
     return table.rename_columns({column: schema.ITEM_ID})
 
 
@@ -239,10 +239,10 @@ def _tabulate_session(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
+    logged = items[session["logged"]]
     body = [("shown before", [reward, *items[item].values()]) for item, reward in history]
-    body.append(("shown next in the log", [None, *items[session["logged"]].values()]))
+    body.append(("shown next in the log", [None, *logged.values()]))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""
         body.append((f"recommended {rank}{again}", [None, *items[item].values()]))
-    columns = ["reward", *items[session["logged"]]]
-    return Table(f"Held-out session {number}", columns, body)
+    return Table(f"Held-out session {number}", ["reward", *logged], body)

@@ -67,13 +67,10 @@ def group_auc(
         scores: (N,) of the shown items, which are `liked` (N,) or not.
         owner: (N,) user of each step, 0 to n_users − 1.
     """
+    import pandas as pd
+
     sizes = np.bincount(owner, minlength=n_users)
-    _, level = np.unique(scores, return_inverse=True)
-    _, place, counts = np.unique(
-        owner * len(scores) + level, return_inverse=True, return_counts=True
-    )
-    # Ranks within users, of equal scores their mean; to import scipy's takes a second.
-    ranks = (counts.cumsum() - (counts - 1) / 2)[place] - (np.cumsum(sizes) - sizes)[owner]
+    ranks = pd.Series(scores).groupby(owner).rank().to_numpy()
     positive = np.bincount(owner, liked, minlength=n_users)
     negative = sizes - positive
     above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2

@@ -175,14 +175,14 @@ def _open_study(folder: Path, seed: int = 0) -> Iterator[Study]:
 def _require_same(study: Study, plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
-    own: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
+    searched: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
     for policy in search.policies:
-        own[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
+        searched[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
     identity = {
         "store": store.record.fingerprint,
         "metric": plan.metric,
         "k": plan.k,
-        "search": config_hash(own),
+        "search": config_hash(searched),
     }
     earlier = study.user_attrs.get("about")
     if earlier is None:

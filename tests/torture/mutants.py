@@ -46,10 +46,10 @@ def _read_rule(path: Path) -> Any:
     return DecisionRule(**json.loads(path.read_text()))
 
 
-def _make_row(value: Any, _: str) -> Any:
+def _make_row(text: str, _: str) -> Any:
     from ucfrec.results.rows import ResultRow
 
-    return ResultRow(**value)
+    return ResultRow(**json.loads(text))
 
 
 def _explain_nothing(module: str) -> Mutant:

@@ -163,6 +163,6 @@ def test_what_cannot_be_searched(store: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="0 trials and 1 workers"):
         tune(plan(store, tmp_path / "tuned"), 0)
     unchosen = Search(("item-rate",), {"rule.choose": False}, True, 0)
-    with pytest.raises(InputError, match=r"item-rate has no estimated value .*use --metric ndcg"):
+    with pytest.raises(InputError, match=r"item-rate has no estimated value.*use --metric ndcg"):
         tune(Plan(store, tmp_path / "tuned", unchosen), 1)
     assert not (tmp_path / "tuned").exists()

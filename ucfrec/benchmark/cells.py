@@ -116,8 +116,8 @@ class Budget:
 
     def seeds_of(self, task: str, method: str) -> int:
         """The number of training seeds of a method on a task."""
-        fewest = min(self.fewer_seeds.get(name, self.seeds) for name in (task, method))
-        return min(self.seeds, fewest)
+        fewer = self.fewer_seeds
+        return min(self.seeds, fewer.get(task, self.seeds), fewer.get(method, self.seeds))
 
     def narrow(
         self,
@@ -157,7 +157,7 @@ class Cell:
     """As `Method.policy`, or a built-in policy of the environments."""
     evaluation: Evaluation
     budget: str = ""
-    """Name of the budget; "" for what has no training and no evaluation."""
+    """Name of the budget."""
     environments: tuple[Environment, ...] = ()
     log_seed: int | None = None
     training_seed: int | None = None
@@ -183,14 +183,12 @@ class Cell:
 
 def make_key(cell: Cell) -> RowKey:
     """The key under which the cell's rows are stored; `run_grid` fills in `config_hash`."""
-    conditions = dict(cell.conditions)
-    if cell.budget:
-        conditions |= {"budget": cell.budget, "episodes": cell.evaluation.episodes}
+    evaluation: dict[str, Scalar] = {"budget": cell.budget, "episodes": cell.evaluation.episodes}
     same = ("suite", "table", "task", "method", "policy", "training_seed", "log_seed")
     return RowKey(
         **{name: getattr(cell, name) for name in same},
         evaluation_seed=cell.evaluation.seed,
-        conditions=conditions,
+        conditions={**cell.conditions, **evaluation},
         data_fingerprint=None if cell.store is None else open_store(cell).record.fingerprint,
     )
 

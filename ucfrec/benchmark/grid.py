@@ -49,23 +49,21 @@ def run_grid(
         tasks.setdefault(str(key), (key, cell))
     if again:
         remove_rows(results, [key for key, _ in tasks.values()])
-        for _, cell in tasks.values():
-            for folder in (cell.run, cell.shared):
-                if folder is not None:
-                    shutil.rmtree(folder, ignore_errors=True)
+        for folder in {folder for _, cell in tasks.values() for folder in (cell.run, cell.shared)}:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
     earlier = read_rows(results)
     rows = {name: [r for r in earlier if key.covers(r)] for name, (key, _) in tasks.items()}
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
     missing = sorted(
         (name for name in tasks if not rows[name]),
-        key=lambda name: -1 if (seed := tasks[name][0].training_seed) is None else seed,
+        key=lambda name: tasks[name][0].training_seed or 0,
     )
     print(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
     )
     if missing:
-        measure = partial(_measure, how.measure, results)
-        calls = {name: partial(measure, *tasks[name]) for name in missing}
+        calls = {name: partial(_measure, how.measure, results, *tasks[name]) for name in missing}
         rows |= _measure_all(calls, workers, describe)
     return [row for group in rows.values() for row in group]
 
@@ -103,14 +101,14 @@ def _measure_all(
 
     with progress(len(calls), describe, "cells") as bar:
         if workers > 1:
-            with pool_of_processes(workers, _use_one_thread) as pool:
+            with pool_of_processes(workers, partial(torch.set_num_threads, 1)) as pool:
                 with block_ctrl_c():
                     keys = {pool.submit(call): key for key, call in calls.items()}
                 for done in as_completed(keys):
                     collect(keys[done], done.result)
         else:
             threads = torch.get_num_threads()
-            _use_one_thread()
+            torch.set_num_threads(1)
             try:
                 for key, call in calls.items():
                     collect(key, call)
@@ -122,12 +120,6 @@ def _measure_all(
             f"first: {errors[0]}"
         )
     return rows
-
-
-def _use_one_thread() -> None:
-    import torch
-
-    torch.set_num_threads(1)
 
 
 def select_names(names: Iterable[str], selected: Sequence[str], what: str) -> list[str]:

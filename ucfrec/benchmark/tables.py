@@ -8,12 +8,9 @@ from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
-DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
-DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
-"""Probability that the distractor is on in an evaluation, for each of these names; None: an
-environment without a distractor."""
+DISTRACTOR_RATES: Final = {"no distractor": None, "distractor off": 0.0, "distractor on": 1.0}
+"""Probability that the distractor is on in an evaluation; None: an environment without one."""
 OURS: Final = "ucf"
-MEAN: Final = "mean"
 NEAR: Final = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
 BySeed = Mapping[tuple[int | None, int | None], float]
@@ -32,24 +29,19 @@ def method_table(rows: Sequence[ResultRow]) -> str:
     for (environment, method), group in groups.items():
         targets = {row.target_return for row in group if row.target_return is not None}
         ours = index_by_seeds(groups.get((environment, OURS), ()) if method != OURS else ())
-        lines.append(
-            (
-                *(environment, method, len(group), *_average(group, *names)),
-                ", ".join(f"{target:g}" for target in sorted(targets)) or NONE,
-                *_average(group, "estimated_value"),
-                _format_difference(subtract(index_by_seeds(group), ours)),
-            )
-        )
+        average, estimate = _average(group, names), _average(group, ["estimated_value"])
+        target = ", ".join(f"{target:g}" for target in sorted(targets)) or NONE
+        more = _format_difference(subtract(index_by_seeds(group), ours))
+        lines.append((environment, method, len(group), *average, target, *estimate, more))
     head = ("environment", "method", "logs × seeds", *names, "target", "estimate", f"− {OURS}")
     return markdown_table(head, lines)
 
 
 def sweep_table(rows: Sequence[ResultRow]) -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
-    lines = [
-        (*case, len(group), *_average(group, "R_cum", "validation_loss", "acceptance"))
-        for case, group in _group_methods(rows).items()
-    ]
+    names = ("R_cum", "validation_loss", "acceptance")
+    groups = _group_methods(rows).items()
+    lines = [(*case, len(group), *_average(group, names)) for case, group in groups]
     head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
     return markdown_table(head, lines)
 
@@ -60,7 +52,7 @@ def _group_methods(
     return grouped(_select_checkpoint(rows), lambda row: (row.environment, row.method))
 
 
-def _average(rows: Sequence[ResultRow], *metrics: str) -> list[str]:
+def _average(rows: Sequence[ResultRow], metrics: Sequence[str]) -> list[str]:
     return [mean_and_sd(row.metrics[n] for row in rows if n in row.metrics) for n in metrics]
 
 
@@ -78,16 +70,15 @@ def distractor_table(rows: Sequence[ResultRow]) -> str:
     # Environments together, the largest target first; methods stay in their order.
     for (environment, quantile, method), group in sorted(groups.items(), key=lambda g: g[0][:2]):
         by_rate = grouped(group, lambda row: row.conditions["distractor"])
-        indexed = [index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
+        indexed = [index_by_seeds(by_rate.get(r, ())) for r in DISTRACTOR_RATES.values()]
         pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
         if not pairs:  # an environment in which no distractor was planted
             continue
-        clean, off, on = ([values[pair] for pair in pairs] for values in indexed)
-        drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
-        spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
+        indexed.append({pair: 100 * (1 - indexed[1][pair] / indexed[0][pair]) for pair in pairs})
+        spread = [mean_and_sd(values[pair] for pair in pairs) for values in indexed]
         lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
     head = ("environment", "target quantile", "method", "logs × seeds")
-    return markdown_table((*head, *DISTRACTOR_NAMES, "drop, %"), lines)
+    return markdown_table((*head, *DISTRACTOR_RATES, "drop, %"), lines)
 
 
 def _select_checkpoint(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -105,14 +96,13 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         checkpoint: "last" or "best"; IQL and CQL keep only their last one, which is always shown.
     """
     rows = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
-    cells = {name: summarise_tasks(own) for name, own in values_by_task(rows, "score").items()}
+    cells = {name: summarise_tasks(tasks) for name, tasks in values_by_task(rows, "score").items()}
     columns = zip(*cells.values(), strict=True)
-    best = [max((own.mean for own in column if own.count), default=0.0) for column in columns]
+    best = [max((cell.mean for cell in column if cell.count), default=0.0) for column in columns]
     lines = []
     for method, scores in cells.items():
-        counts = [own.count for own in scores[:-1]]
-        fewest, most = min(filter(None, counts)), max(counts)
-        seeds = str(most) if fewest == most else f"{fewest}–{most}"
+        counts = [cell.count for cell in scores[:-1] if cell.count]
+        seeds = "–".join(dict.fromkeys(map(str, (min(counts), max(counts)))))
         texts = map(_format_score, scores, best)
         lines.append({"method": method, "seeds": seeds, **_name_columns(rows, texts)})
     return lines
@@ -125,7 +115,7 @@ def _format_score(scores: Summary, best: float) -> str:
 
 def _name_columns(rows: Sequence[ResultRow], texts: Iterable[str]) -> dict[str, str]:
     """Texts of all datasets of the rows, and of the mean over them, by name."""
-    return dict(zip((*dict.fromkeys(row.task for row in rows), MEAN), texts, strict=True))
+    return dict(zip((*dict.fromkeys(row.task for row in rows), "mean"), texts, strict=True))
 
 
 def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -133,8 +123,8 @@ def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     checkpoint."""
     best: list[ResultRow] = []
     for group in grouped(rows, lambda row: (row.task, row.method, row.checkpoint)).values():
-        targets = grouped(group, lambda row: row.target_return)
-        best += max(targets.values(), key=lambda same: summary(row.value for row in same).mean)
+        targets = grouped(group, lambda row: row.target_return).values()
+        best += max(targets, key=lambda same: summary(row.value for row in same).mean)
     return best
 
 
@@ -143,13 +133,11 @@ def average_seeds(
 ) -> list[dict[str, Any]]:
     """One line per combination of `by`: `values`, where a line of `ResultRow.as_line` has them, as
     mean ± standard deviation over seeds."""
-    averages = []
-    for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items():
-        average = dict(zip(by, key, strict=True))
-        for name in values:
-            average[name] = mean_and_sd(ln[name] for ln in group if ln.get(name) is not None)
-        averages.append(average)
-    return averages
+    return [
+        dict(zip(by, key, strict=True))
+        | {n: mean_and_sd(ln[n] for ln in group if ln.get(n) is not None) for n in values}
+        for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items()
+    ]
 
 
 def difference_table(
@@ -159,8 +147,8 @@ def difference_table(
     difference to `first` with the same seed, mean ± standard error over the seeds that both have;
     then the mean over datasets if both have rows of all."""
     values, lines = values_by_task(rows, metric), []
-    for method, own in values.items():
-        of_tasks = list(map(subtract, own, values.get(first, [{}] * len(own))))
+    for method, tasks in values.items():
+        of_tasks = list(map(subtract, tasks, values.get(first, [{}] * len(tasks))))
         if method != first and any(of_tasks):
             mean = _format(summarise_tasks(of_tasks)[-1], "+.3g")
             texts = _name_columns(rows, [*map(_format_difference, of_tasks), mean])
@@ -195,7 +183,7 @@ def summarise_tasks(of_tasks: Sequence[BySeed]) -> list[Summary]:
     if all(task.keys() == of_tasks[0].keys() for task in of_tasks):
         means = [summary(task[seeds] for task in of_tasks).mean for seeds in of_tasks[0]]
     else:
-        means = [summary(own.mean for own in summaries).mean] if all(of_tasks) else []
+        means = [summary(task.mean for task in summaries).mean] if all(of_tasks) else []
     return [*summaries, summary(means)]
 
 

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +16,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
-from ucfrec.recommending.recommend import RANK, recommend, sessions_of
+from ucfrec.recommending.recommend import recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 PARTS: Final = ("policy", "exposure", "reward weight", "lookahead")
@@ -32,16 +31,10 @@ class Card:
     """One recommended item."""
 
     item_id: Any
-    rank: int
     propensity: float
     """Probability of the item at its position, given those before it."""
     parts: Mapping[str, float]
     """What each of `PARTS` adds to its score, relative to the mean of all items (nats)."""
-
-    @property
-    def score(self) -> float:
-        """The sum of the parts."""
-        return sum(self.parts.values())
 
 
 @dataclass(frozen=True)
@@ -78,14 +71,15 @@ def explain(
     numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)
     sessions = sessions_of(trained, latest, trained.scorer().length)
-    parts = _parts(trained.scorer(rule), sessions)
-    numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
-    cards = []
-    for number, row in zip(numbers, frame.to_dict("records"), strict=True):
-        own = {name: float(part[number]) for name, part in parts.items()}
-        cards.append(Card(row[schema.ITEM_ID], row[RANK], row[schema.PROPENSITY], own))
-    shown, rewards = user.item_ids[::-1].tolist(), user.rewards[::-1].tolist()
-    rows = list(zip(shown, rewards, strict=True))
+    parts = _score_parts(trained.scorer(rule), sessions)
+    ids = frame[schema.ITEM_ID].to_numpy()
+    cards = [
+        Card(item_id, chance, {name: float(part[number]) for name, part in parts.items()})
+        for item_id, number, chance in zip(
+            ids.tolist(), trained.items.numbers(ids), frame[schema.PROPENSITY], strict=True
+        )
+    ]
+    rows = list(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
     excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
     return Explained(rows, cards, excluded)
 
@@ -108,40 +102,39 @@ def read_pasted(text: str) -> pd.DataFrame:
             rewards.append(float(reward) if comma else 0.0)
         except ValueError:
             rewards.append(np.nan)
-        if not np.isfinite(rewards[-1]) or abs(rewards[-1]) > schema.LARGEST_REWARD:
+        if not abs(rewards[-1]) <= schema.LARGEST_REWARD:
             raise InputError(
                 f"line {number} of the history is {line[:60]!r}; write item_id, or item_id, reward"
             )
-    now = int(time.time() * 1000)
-    times = now - 60_000 * np.arange(len(items), 0, -1)
+    times = int(time.time() * 1000) - 60_000 * np.arange(len(items), 0, -1)
     frame = pd.DataFrame({schema.USER_ID: "pasted", schema.ITEM_ID: items})
     return frame.assign(timestamp=times, session_id=0, reward=rewards)
 
 
-def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:
+def _simplify(rule: DecisionRule, **changes: Any) -> DecisionRule:
     """The rule without filters and draws."""
     nothing = {"tag_window": 0, "tag_run": 0, "exclude_seen": False, "temperature": 0.0}
     return replace(rule, **{**nothing, "explore": 0.0, **changes})
 
 
-def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
+def _score_parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
     """(n_items,) of each of `PARTS`, less its mean over all items."""
-    rule = scorer.rule
+    rule = _simplify(scorer.rule)
 
-    def scores(**changes: Any) -> Tensor:
-        return scorer.under(_plain(rule, **changes)).scores(sessions, empty=True)[0].double()
+    def score(**changes: Any) -> Tensor:
+        return scorer.under(replace(rule, **changes)).scores(sessions, empty=True)[0].double()
 
-    alone = scorer.under(_plain(rule, reward_weight=0.0, lookahead=0.0))
+    alone = scorer.under(replace(rule, reward_weight=0.0, lookahead=0.0))
     query = alone.query(sessions)
     exposed = unexposed = alone.scores_of(query, empty=True)[0].double()
     if query.policy is not None:
         none = torch.zeros_like(query.policy.repeated)
         query = query._replace(policy=query.policy._replace(repeated=none, alike=none))
         unexposed = alone.scores_of(query, empty=True)[0].double()
-    rewarded = scores(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
-    sums = (torch.zeros_like(exposed), unexposed, exposed, rewarded, scores())
-    parts = [after - before for before, after in pairwise(sums)]
-    return {name: part - part.mean() for name, part in zip(PARTS, parts, strict=True)}
+    rewarded = score(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
+    sums = torch.stack((torch.zeros_like(exposed), unexposed, exposed, rewarded, score()))
+    parts = sums.diff(dim=0)
+    return dict(zip(PARTS, parts - parts.mean(1, keepdim=True), strict=True))
 
 
 def _find_excluded(
@@ -159,7 +152,8 @@ def _find_excluded(
         ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),
     ):
         if limit := getattr(rule, name):
-            filtered = trained.scorer(_plain(rule, **{name: limit})).scores(sessions, empty=True)[0]
+            scorer = trained.scorer(_simplify(rule, **{name: limit}))
+            filtered = scorer.scores(sessions, empty=True)[0]
             excluded[words] = torch.isneginf(filtered).nonzero()[:, 0]
     if rule.exclude_seen:
         excluded["this session has shown it"] = sessions.actions[0]
@@ -168,6 +162,9 @@ def _find_excluded(
     # Of several reasons, the last one here.
     reasons = {n: words for words, numbers in excluded.items() for n in numbers.tolist()}
     order = torch.argsort(scores, descending=True, stable=True).tolist()
-    ids = trained.items.ids
-    ranked = [(rank, number) for rank, number in enumerate(order, start=1) if number in reasons]
-    return [Excluded(ids[number], rank, reasons[number]) for rank, number in ranked[:_EXCLUDED]]
+    ranked = [
+        Excluded(trained.items.ids[number], rank, reasons[number])
+        for rank, number in enumerate(order, start=1)
+        if number in reasons
+    ]
+    return ranked[:_EXCLUDED]

@@ -10,13 +10,17 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from fastapi import FastAPI, Request, Response
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, explain, read_pasted
+from ucfrec.exploring.explain import explain, read_pasted
 from ucfrec.files.record import CARD
 from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
@@ -73,21 +77,21 @@ class Explorer:
         )
         """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
         rows = [] if features is None else features.to_pylist()
-        self._features = {str(row[schema.ITEM_ID]): row for row in rows}
+        self._features = {str(row.pop(schema.ITEM_ID)): row for row in rows}
 
     def page(self, fields: Mapping[str, str]) -> str:
         """The whole page, for the fields of the form by name; unknown ones are ignored."""
         runs = []
-        for run in self.runs:
-            card, text = run.folder / CARD, "There is no model card."
-            if card.exists():
-                text = card.read_text(encoding="utf-8", errors="backslashreplace")
-            runs.append((run.folder.name, run, text))
+        for folder in (run.folder for run in self.runs):
+            text = "There is no model card."
+            if (folder / CARD).exists():
+                text = (folder / CARD).read_text(encoding="utf-8", errors="backslashreplace")
+            runs.append((folder.name, text))
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
             given=fields,
             runs=runs,
-            sliders=self._sliders(fields),
+            sliders=self._list_sliders(fields),
             values=self.values,
             chart=self.values_chart,
             users=self.runs[0].user_ids[:_USERS_LISTED].tolist(),
@@ -121,25 +125,22 @@ class Explorer:
                 k = round(_read_number(fields, "k", 1, _MOST_ITEMS, 10))
                 for trained in self.runs:
                     history, rule = _read_history(trained, fields), _read_rule(trained, fields)
-                    filter_seen = fields.get("keep_seen") is None
-                    explained = explain(trained, rule, history, k, filter_seen)
-                    lists.append((trained.folder.name, str(rule), explained))
+                    reasons = explain(trained, rule, history, k, "keep_seen" not in fields)
+                    lists.append((trained.folder.name, str(rule), reasons))
         except InputError as fault:
             lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in explained.cards} for *_, explained in lists]
-        cards = (card for *_, explained in lists for card in explained.cards)
-        widest = max((abs(part) for card in cards for part in card.parts.values()), default=0.0)
+        ids = [{str(card.item_id) for card in reasons.cards} for *_, reasons in lists]
+        cards = (card for *_, reasons in lists for card in reasons.cards)
         return {
             "lists": lists,
             "error": error,
             "common": ids[0] & ids[1] if len(ids) == 2 else None,
-            "parts": PARTS,
-            "widest": widest or 1.0,
-            "item": self._item,
+            "widest": max((abs(x) for card in cards for x in card.parts.values()), default=0) or 1,
+            "item": self._describe_item,
         }
 
-    def _sliders(self, fields: Mapping[str, str]) -> list[dict[str, Any]]:
-        """The numbers of the rule that a visitor can change, fields of `DecisionRule`."""
+    def _list_sliders(self, fields: Mapping[str, str]) -> list[tuple[Any, ...]]:
+        """Numbers that a visitor can change: field of `DecisionRule`, label, range, step, value."""
         trained, states = self.runs[0], self.runs[0].item_states
         lowest, highest = float(trained.training_returns[0]), float(trained.training_returns[-1])
         span = max(highest - lowest, abs(highest), 1e-6)
@@ -149,21 +150,19 @@ class Explorer:
         sliders.append(("temperature", "Temperature", 0, 2, 0.05))
         if states is not None and bool((states.tags >= 0).any()):
             sliders.append(("tag_window", "Exclude tags of the last items", 0, 10, 1))
-        shown = []
+        set_to = []
         for name, label, low, high, step in sliders:
             value = getattr(trained.rule, name)
             # Where a number is wrong, the list says so.
             if "custom" in fields and fields.get(name):
                 with suppress(InputError):
                     value = _read_number(fields, name, low, high)
-            slider = {"name": name, "label": label, "low": low, "high": high, "step": step}
-            shown.append({**slider, "value": highest if value is None else value})
-        return shown
+            set_to.append((name, label, low, high, step, highest if value is None else value))
+        return set_to
 
-    def _item(self, item_id: Any) -> dict[str, Any]:
+    def _describe_item(self, item_id: Any) -> dict[str, str]:
         """Title, picture and other features of an item."""
         row = {**self._features.get(str(item_id), {})}
-        row.pop(schema.ITEM_ID, None)
         title = next((row.pop(name) for name in _TITLES if name in row), None)
         image = next((str(row.pop(name)) for name in _IMAGES if name in row), "")
         features = "; ".join(f"{name} {value}" for name, value in row.items() if value)
@@ -218,33 +217,26 @@ def _read_number(
     return value
 
 
-def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
+def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> Starlette:
     """The application, which answers the given values of `Host` and keeps no state of visitors."""
-    app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
 
-    def html(text: str) -> Response:
+    def answer(text: str, kind: str = "html") -> Response:
         # Texts of files may have bytes that are not valid Unicode.
         content = text.encode("utf-8", errors="backslashreplace")
-        return Response(content, media_type="text/html; charset=utf-8", headers=_HEADERS)
+        return Response(content, headers=_HEADERS, media_type=f"text/{kind}; charset=utf-8")
 
-    @app.get("/")
-    def page(request: Request) -> Response:
-        return html(explorer.page(request.query_params))
-
-    @app.get("/results")
-    def results(request: Request) -> Response:
-        return html(explorer.results(request.query_params))
-
-    @app.get("/explore.js")
-    def javascript() -> Response:
-        return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
-
-    @app.get("/report/{number}")
-    def report(number: int) -> Response:
-        if not 0 <= number < len(explorer.runs):
+    def report(request: Request) -> Response:
+        number = request.path_params["number"]
+        if number >= len(explorer.runs):
             return Response("there is no such run", 404)
-        return html(explorer.reports[number])
+        return answer(explorer.reports[number])
 
-    return app
+    routes = [
+        Route("/", lambda request: answer(explorer.page(request.query_params))),
+        Route("/results", lambda request: answer(explorer.results(request.query_params))),
+        Route("/explore.js", lambda _: answer(script, "javascript")),
+        Route("/report/{number:int}", report),
+    ]
+    hosts = Middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
+    return Starlette(routes=routes, middleware=[hosts])

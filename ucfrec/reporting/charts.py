@@ -86,9 +86,7 @@ class Interval:
     reliable: bool | None = None
     """Whether a verdict lets the value stand; None where there is no verdict."""
 
-    @property
-    def summary(self) -> str:
-        """The numbers, and the verdict in words."""
+    def __str__(self) -> str:
         verdicts = {True: ", the estimate stands", False: ", do not rely on it", None: ""}
         ends = f"95% interval {self.low:.4g} to {self.high:.4g}"
         return f"{self.name}: {self.value:.4g}, {ends}{verdicts[self.reliable]}"
@@ -194,7 +192,7 @@ def interval_chart(title: str, intervals: Sequence[Interval], logged: float | No
             axes.plot(interval.value, middle, "o", color=SERIES[0], markerfacecolor=fill, zorder=3)
         axes.plot((interval.low, interval.high), (middle, middle), "|", color=INK, markersize=8)
         axes.hlines(middle, interval.low, interval.high, color=INK, linewidth=1, linestyle=dashes)
-    summaries = [interval.summary for interval in intervals]
+    summaries = list(map(str, intervals))
     if logged is not None:
         summaries.append(f"For comparison, logged sessions: {logged:.4g}")
         axes.axvline(logged, color=INK, linestyle="dotted", linewidth=1)
@@ -231,15 +229,13 @@ def render(figure: "Figure", title: str, summary: str) -> Chart:
     file = io.StringIO()
     none = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     figure.savefig(file, format="svg", metadata=none)
-    text = file.getvalue()
-    box = re.search(r'viewBox="[\d. ]+"', text)
-    assert box is not None
-    body = text[text.index("</defs>") + len("</defs>") :]
+    head, _, body = file.getvalue().partition("</defs>")
+    (box,) = re.findall(r'viewBox="[\d. ]+"', head)
     body = re.sub(r'<g id="[\w.]+"', "<g", body).replace("xlink:href", "href")
     body = re.sub(r"(?<=: )#01\w\wfe(?=[;\"])", lambda color: f"var(--{_COLORS[color[0]]})", body)
     body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
     label = html.escape(one_line(f"{title}. {summary}"))
-    return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')
+    return Chart(title, summary, f'<svg {box} role="img" aria-label="{label}">{body}')
 
 
 # Figures that are files: colors and the column widths of a paper.

@@ -66,13 +66,13 @@ def rank_policies(
     )
     rows = [replace(row, checkpoint=checkpoint) for row in rows]
     warnings = []
-    for number, ((policy, _), row) in enumerate(zip(candidates, rows, strict=False)):
+    for (policy, _), row in zip(candidates, rows, strict=False):
         doubts = [] if logs == TEST_SPLIT else seen_too_often(share_seen(policy, logged.store))
-        if logged.rows.earlier is None and number == 0:
+        if logged.rows.earlier is None and policy is trained:
             doubts.append(HISTORY_LACKING)
         add_ranking(policy.folder, row, logs, doubts)
-        alone = len(candidates) == 1
-        warnings += [doubt if alone else f"{policy.folder}: {doubt}" for doubt in doubts]
+        where = "" if len(candidates) == 1 else f"{policy.folder}: "
+        warnings += [f"{where}{doubt}" for doubt in doubts]
     return Ranking(rows, warnings)
 
 

@@ -17,7 +17,7 @@ from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.provenance import config_hash, shorten_paths
-from ucfrec.reporting.tables import Table, markdown_table
+from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
@@ -34,10 +34,12 @@ def write_card(run: Path) -> Path:
     """
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
-    fit, window = record.policy, _training_window(record, refitted)
+    fit, times, splits = record.policy, record.data.time_range_ms, record.data.split_times_ms
+    if times and splits and not refitted:
+        times = times[0], min(splits[0], times[1])
+    window = [f"{datetime.fromtimestamp(time / 1000, UTC):%Y-%m-%d %H:%M}" for time in times or ()]
     data = describe_data(record) | {"reward": f"`{record.reward}`"}
-    if window is not None:
-        data["training window (UTC)"] = " to ".join(map(_format_day, window))
+    data["training window (UTC)"] = " to ".join(window) or None
     parts = [
         f"# Model card: {record.name}",
         _tabulate(
@@ -55,7 +57,7 @@ def write_card(run: Path) -> Path:
         "## How it acts",
         _describe_rule(run, record),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _list_limits(run, record, refitted)),
+        "\n".join(f"- {limit}" for limit in _list_limits(run, record, refitted, window) if limit),
         "## Measured",
         _describe_measurements(_read_measured(run)),
     ]
@@ -78,8 +80,7 @@ def add_measurement(
         return
     with claim(run / MEASURED, wait=True):
         unchanged = [row for row in _read_measured(run) if (row["how"], row["of"]) != (how, of)]
-        present = {name: value for name, value in values.items() if value is not None}
-        measured = {"how": how, "of": of, "values": present, "said": list(remarks)}
+        measured = {"how": how, "of": of, "values": dict(values), "said": list(remarks)}
         write_json(run / MEASURED, [*unchanged, measured])
         write_card(run)
 
@@ -103,8 +104,8 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
     values = _select_values(row, names, {"R_cum": row.interval}) | {"logged": rows[LOGGED].value}
-    others = [text for text in report.warnings if text not in report.verdict.reasons]
-    add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *others])
+    warnings = [text for text in report.warnings if text not in report.verdict.reasons]
+    add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *warnings])
 
 
 def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
@@ -120,15 +121,13 @@ def _format_rule(row: ResultRow) -> str:
 
 
 def _select_values(
-    row: ResultRow, names: Iterable[str], intervals: Mapping[str, Sequence[float] | None]
+    row: ResultRow, names: Sequence[str], intervals: Mapping[str, Sequence[float] | None]
 ) -> dict[str, object]:
     """The named values, with the intervals of those that have one."""
-    line = row.as_line()
-    values: dict[str, object] = {}
-    for name in names:
-        values[name] = line.get(name)
-        if name in row.metrics and (ends := intervals.get(name)) is not None:
-            values[name] = f"{line[name]:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
+    values = dict(zip(names, map(row.as_line().get, names), strict=True))
+    for name in values.keys() & row.metrics:
+        if (ends := intervals.get(name)) is not None:
+            values[name] = f"{values[name]:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
     return values
 
 
@@ -170,18 +169,6 @@ def describe_data(record: RunRecord) -> dict[str, object]:
     return {name: value for name, value in rows.items() if value is not None}
 
 
-def _training_window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
-    """Times (ms) of the first training row, and from which on rows are no longer trained on."""
-    times, splits = record.data.time_range_ms, record.data.split_times_ms
-    if times is None or splits is None or refitted:
-        return times
-    return times[0], min(splits[0], times[1])
-
-
-def _format_day(milliseconds: int) -> str:
-    return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M")
-
-
 def _describe_rule(run: Path, record: RunRecord) -> str:
     text = "Its decision rule is not chosen yet."
     if (run / RULE).exists():
@@ -194,41 +181,32 @@ def _describe_rule(run: Path, record: RunRecord) -> str:
     return f"{text}\n\nThe user model, which chose the rule:\n\n{_tabulate(numbers)}"
 
 
-def _list_limits(run: Path, record: RunRecord, refitted: bool) -> list[str]:
-    items = record.sizes["items"]
-    limits = []
-    if record.refit_of is not None:
-        limits.append("It was trained on all rows of its store: only later logs can evaluate it.")
-    elif refitted:
-        limits.append(
-            "Once everything was chosen, it went on learning from all rows of its store: only "
-            "later logs can evaluate it. What the test split shows is of the weights before that."
-        )
-    if items:
-        limits.append(f"It knows {items:,} items and never shows another one.")
-    window = _training_window(record, refitted)
-    if window is not None:
-        limits.append(
-            f"It was not trained on anything after {_format_day(window[1])} UTC; tastes and items "
-            "change."
-        )
-    unknown = record.data.unknown_propensities
-    if items and unknown is None:
-        limits.append(
-            "Its logs have no propensities: its return cannot be estimated from them without a "
-            "model of how items were chosen."
-        )
-    elif unknown:
-        limits.append(f"{unknown:,} steps of its logs have no propensity.")
-    if warning := record.learned_nothing(read_metrics(run / "policy")):
-        limits.append(f"{warning[0].upper()}{warning[1:]}.")
-    if record.augmentation is not None:
-        limits.append(f"Counterfactual augmentation: {record.augmentation.verdict}")
-    limits.append(
-        "A validation loss says how well logged choices are predicted, not the return: see "
-        "what was measured."
-    )
-    return limits
+def _list_limits(
+    run: Path, record: RunRecord, refitted: bool, window: Sequence[str]
+) -> list[object]:
+    """Sentences, and false values for those that do not hold."""
+    items, unknown = record.sizes["items"], record.data.unknown_propensities
+    whole = record.refit_of is not None
+    warning, copies = record.learned_nothing(read_metrics(run / "policy")), record.augmentation
+    return [
+        whole and "It was trained on all rows of its store: only later logs can evaluate it.",
+        refitted
+        and not whole
+        and "Once everything was chosen, it went on learning from all rows of its store: only "
+        "later logs can evaluate it. What the test split shows is of the weights before that.",
+        items and f"It knows {items:,} items and never shows another one.",
+        window
+        and f"It was not trained on anything after {window[1]} UTC; tastes and items change.",
+        items
+        and unknown is None
+        and "Its logs have no propensities: its return cannot be estimated from them without a "
+        "model of how items were chosen.",
+        unknown and f"{unknown:,} steps of its logs have no propensity.",
+        warning and f"{warning[0].upper()}{warning[1:]}.",
+        copies and f"Counterfactual augmentation: {copies.verdict}",
+        "A validation loss says how well logged choices are predicted, not the return: see what "
+        "was measured.",
+    ]
 
 
 def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
@@ -246,9 +224,8 @@ def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _tabulate(rows: Mapping[str, object]) -> str:
-    present = {name: value for name, value in rows.items() if value is not None}
-    body = Table.of_columns("", {"value": present}).rows
-    return markdown_table(["what", "value"], [(name, *cells) for name, cells in body])
+    body = [(name, format_value(value)) for name, value in rows.items() if value is not None]
+    return markdown_table(["what", "value"], body)
 
 
 def describe_user_model(record: RunRecord) -> dict[str, object]:

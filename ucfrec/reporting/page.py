@@ -68,8 +68,7 @@ class _Run:
     @property
     def references(self) -> Mapping[str, float]:
         """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
-        losses = self.record.reference_losses
-        return losses if losses and "action_loss" in self.logged else {}
+        return (self.record.reference_losses or {}) if "action_loss" in self.logged else {}
 
 
 def write_report(
@@ -98,8 +97,7 @@ def render_report(
     Raises:
         InputError: a folder is not a run, or a file has no such rows or features.
     """
-    read = _read_runs(runs)
-    by_data = grouped(read, lambda run: run.record.fingerprint)
+    loaded = _read_runs(runs)
     environments, estimates = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
@@ -108,14 +106,14 @@ def render_report(
             "estimates": draw_estimates(estimates),
             "forest": draw_forest(estimates),
         }
-    features = None if items is None else read_features(items, [run.record.data for run in read])
+    features = None if items is None else read_features(items, [run.record.data for run in loaded])
     warnings, sections = [], []
-    for group in by_data.values():
+    for group in grouped(loaded, lambda run: run.record.fingerprint).values():
         for run in group:
             with damage_explained(run.folder / RUN, _REMEDY):
-                warnings += [(run.name, text) for text in _warnings(run)]
+                warnings += [(run.name, text) for text in _list_warnings(run)]
         with damage_explained(group[0].folder / RUN, _REMEDY):
-            sections.append(_section(group, features))
+            sections.append(_fill_section(group, features))
     return template("ucfrec.reporting", "report.html").render(
         version=__version__, warnings=warnings, sections=sections, points=POINTS, **evaluated
     )
@@ -139,16 +137,16 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
     paths = dict.fromkeys(folder.resolve() for folder in folders)
     common = os.path.commonpath([path.parent for path in paths]) if paths else ""
     for path in paths:
-        record = read_record(path)
+        record, stage = read_record(path), path / AUGMENTATION
         augmentation = record.augmentation
-        if augmentation is None and (path / AUGMENTATION).exists():
-            augmentation = read_augmentation(path / AUGMENTATION)
+        if augmentation is None and stage.exists():
+            augmentation = read_augmentation(stage)
         logged = select_curves(read_metrics(path / "policy"), record.settings)
         runs.append(_Run(path, str(path.relative_to(common)), record, augmentation, logged))
     return runs
 
 
-def _warnings(run: _Run) -> list[str]:
+def _list_warnings(run: _Run) -> list[str]:
     """Reasons why the results of a run may be unreliable."""
     report = run.augmentation
     warnings = [run.status] if run.record.policy is None else []
@@ -160,23 +158,23 @@ def _warnings(run: _Run) -> list[str]:
     return [text for text in warnings if text]
 
 
-def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
+def _fill_section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
     names, record = [run.name for run in runs], runs[0].record
     edited, user_models, frontiers, samples = [], [], [], []
     for style, run in enumerate(runs):
         if run.augmentation is not None:
             edited.append((run.name, style, run.augmentation))
+        if parts := describe_user_model(run.record):
+            table = Table.of_columns("User model, on held-out rows", {"value": parts})
+            user_models.append((run.name, table))
+        if picture := draw_frontier(run.record, read_candidates(run.folder)):
+            frontiers.append((run.name, *picture))
         if run.record.sizes["items"]:
-            if parts := describe_user_model(run.record):
-                table = Table.of_columns("User model, on held-out rows", {"value": parts})
-                user_models.append((run.name, table))
-            if (drawn := draw_frontier(run.record, read_candidates(run.folder))) is not None:
-                frontiers.append((run.name, drawn))
             samples.append((run.name, tabulate_samples(run.folder, features)))
     pictures, quantiles = draw_distributions(record.data)
     return {
-        "names": names,
+        "runs": runs,
         "store": record.store,
         "data": Table.of_columns("Training data", {"value": describe_data(record)}),
         "rows": format_report(record.data.model_dump()) if record.data.rows_read else "",
@@ -184,10 +182,6 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "quantiles": quantiles,
         "summary": _summarise(runs),
         "curves": draw_curves(names, [r.logged for r in runs], [r.references for r in runs]),
-        "unlogged": [run.name for run in runs if not run.logged],
-        "finished": any(run.record.policy is not None for run in runs),
-        "references": any(run.references for run in runs),
-        "verdicts": [(name, report.verdict) for name, _, report in edited],
         "augmentation": tabulate_augmentation(edited) if edited else None,
         "moves": draw_moves(edited),
         "user_models": user_models,
@@ -201,17 +195,16 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
 def _summarise(runs: Sequence[_Run]) -> Table:
     columns = {}
     for run in runs:
-        fit = run.record.policy
+        fit, losses = run.record.policy, run.references
         columns[run.name] = {
             "policy": run.record.name,
             "seed": str(run.record.seed),
             "status": run.status,
             "best validation loss": fit and fit.best_validation,
             "at step": fit and fit.best_step,
-            "wall time, s": run.record.wall_time_s if fit else None,
+            "wall time, s": fit and run.record.wall_time_s,
+            **{f"loss with {n}": losses[key] for key, n in REFERENCES.items() if key in losses},
         }
-        known = {key: name for key, name in REFERENCES.items() if key in run.references}
-        columns[run.name] |= {f"loss with {name}": run.references[k] for k, name in known.items()}
     return Table.of_columns("Runs", columns)
 
 

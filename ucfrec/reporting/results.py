@@ -15,7 +15,7 @@ from ucfrec.off_policy.estimators import LOGGED, SUITE
 from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, format_value
 from ucfrec.results.rows import ResultRow, read_results
-from ucfrec.results.statistics import grouped
+from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.record import Candidate, RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
@@ -60,11 +60,11 @@ def read_evidence(paths: Sequence[Path]) -> tuple[Environments, Sequence[Estimat
                 )
             if row.suite != SUITE:
                 environments.setdefault(row.environment or row.task, []).append(row)
-                continue
             # The rows of one call of `ucfrec ope` begin with `logged`.
-            if (row.method == LOGGED and not by_step) or not calls:
-                calls.append([])
-            calls[-1].append(row)
+            elif (row.method == LOGGED and not by_step) or not calls:
+                calls.append([row])
+            else:
+                calls[-1].append(row)
         estimates += map(_group_estimates, calls)
     return environments, estimates
 
@@ -73,12 +73,11 @@ def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
     steps = [row for row in group if row.metric == _STEP]
     rows = [row for row in group if row.metric != _STEP]
     first = next((row for row in rows if row.method != LOGGED), group[0])
-    name, conditions = first.policy, first.conditions
+    name, choice, run = first.policy, first.conditions.get("choice"), first.conditions.get("run")
     if first.details.get("selection") is not None:
         name += f" ({first.details.get('candidate')})"
     else:
-        name += f" ({conditions['choice']})" if conditions.get("choice") is not None else ""
-        name += f" of {conditions['run']}" if conditions.get("run") is not None else ""
+        name += ("" if choice is None else f" ({choice})") + ("" if run is None else f" of {run}")
     warnings = (row.details.get("warnings") for row in group)
     texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
     return Estimates(name, rows, tuple(dict.fromkeys(texts)), steps)
@@ -86,26 +85,27 @@ def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
 
 def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
     """The row that the verdict is of, if it has an interval."""
-    quoted = (row for row in rows if row.interval and row.method == row.details.get("verdict_of"))
-    return next(quoted, None)
+    return next((r for r in rows if r.interval and r.method == r.details.get("verdict_of")), None)
 
 
 def draw_environments(environments: Environments) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
     for environment, rows in environments.items():
-        lines, named = [evaluation_line(row) for row in rows], []
-        for row, line in zip(rows, lines, strict=True):
+        lines, names = [evaluation_line(row) for row in rows], []
+        for line in lines:
             # The policy, with the fields that differ if it has several rows.
-            same = [other for other in lines if other["policy"] == line["policy"]]
-            fields = ("run", "checkpoint", *_SEEDS)
-            differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-            parts = (f"{key} {format_value(line.get(key))}" for key in differing)
-            named.append((", ".join([line["policy"], *parts]), row))
+            same = [ln for ln in lines if ln["policy"] == line["policy"]]
+            parts = (
+                f", {key} {format_value(line.get(key))}"
+                for key in ("run", "checkpoint", *_SEEDS)
+                if any(ln.get(key) != line.get(key) for ln in same)
+            )
+            names.append(line["policy"] + "".join(parts))
         columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
         title, caption = f"R_cum in {environment}", f"{environment}: means of episodes"
-        heads = {column: column for column in columns}
-        pictures.append(_draw_rows(title, caption, {"R_cum": "R_cum"} | heads, named, "policy"))
+        heads = {column: column for column in ("R_cum", *columns)}
+        pictures.append(_draw_rows(title, caption, heads, names, rows, "policy"))
     return pictures
 
 
@@ -125,11 +125,10 @@ def draw_estimates(
             (estimates.steps, "steps", by_step, "Mean reward of a step with a propensity",
              "Estimates per step"),
         ):  # fmt: skip
-            named = [(f"logged {unit}" if r.method == LOGGED else r.method, r) for r in rows]
-            if named:
-                parts.append(
-                    _draw_rows(f"{title}: {name}", f"{caption} for {name}", columns, named)
-                )
+            names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
+            if names:
+                title, caption = f"{title}: {name}", f"{caption} for {name}"
+                parts.append(_draw_rows(title, caption, columns, names, rows))
         pictures.append((parts, estimates.warnings))
     return pictures
 
@@ -138,18 +137,18 @@ def _draw_rows(
     title: str,
     caption: str,
     columns: Mapping[str, str],
-    named: Sequence[tuple[str, ResultRow]],
+    names: Sequence[str],
+    rows: Sequence[ResultRow],
     corner: str = "",
 ) -> tuple[Chart, Table]:
     """Chart of the intervals, and table of the columns, {value: head}, the first with intervals."""
     intervals, body = [], []
-    for name, row in named:
-        first, *values = (evaluation_line(row).get(key) for key in columns)
+    for name, row in zip(names, rows, strict=True):
+        first, *values = map(evaluation_line(row).get, columns)
         ends = "–"
         if row.interval is not None:
-            low, high = row.interval
-            intervals.append(Interval(name, row.value, low, high))
-            ends = f"{format_value(low)}, {format_value(high)}"
+            intervals.append(Interval(name, row.value, *row.interval))
+            ends = ", ".join(map(format_value, row.interval))
         body.append((name, [f"{format_value(first)} [{ends}]", *values]))
     chart = interval_chart(f"{title}, with 95% intervals", intervals)
     return chart, Table(caption, list(columns.values()), body, corner)
@@ -160,11 +159,9 @@ def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
     intervals, logged = [], set()
     for estimates in all_estimates:
         logged |= {row.value for row in estimates.rows if row.method == LOGGED}
-        row = find_quoted(estimates.rows)
-        if row is not None and row.interval is not None:
-            (low, high), reliable = row.interval, row.details.get("reliable") is True
-            name = f"{estimates.name}: {row.method}"
-            intervals.append(Interval(name, row.value, low, high, reliable))
+        if (row := find_quoted(estimates.rows)) and row.interval:
+            name, reliable = f"{estimates.name}: {row.method}", row.details.get("reliable") is True
+            intervals.append(Interval(name, row.value, *row.interval, reliable))
     if not intervals:
         return None
     # The line is of one set of logs; several have a line each in their own charts.
@@ -177,13 +174,13 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
     where the log has no propensities."""
     if record.rule is None:
         return None
-    known = [
+    places = [
         (c.evidence.effective_users, c.value, c.rule, c.evidence.interval)
         for c in candidates
         if c.value is not None and c.evidence and c.evidence.effective_users is not None
     ]
     curve, body = dict[float, float](), []
-    for users, value, rule, ends in sorted(known, key=lambda place: (-place[0], -place[1])):
+    for users, value, rule, ends in sorted(places, key=lambda place: (-place[0], -place[1])):
         if value > max(curve.values(), default=-math.inf):
             curve[users] = value
             between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
@@ -191,8 +188,8 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
     if not curve:
         return None
     curves = [("best rule", 0, curve)]
-    if chosen := [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]:
-        curves.append(("chosen rule", 1, dict(chosen[:1])))
+    if chosen := [place for place in places if place[2] == record.rule.rule]:
+        curves.append(("chosen rule", 1, dict([chosen[0][:2]])))
     title = "Value in the search for a rule, against evidence"
     chart = line_chart(title, "effective users of the log", curves)
     head = ["value in the search", "effective users", "off-policy interval"]
@@ -207,24 +204,6 @@ NO_RESULTS = (
 )
 
 
-@dataclass(frozen=True)
-class _Return:
-    """Return of one policy in one environment, over all its rows."""
-
-    policy: str
-    trained: bool
-    trainings: int
-    """Number of distinct training seeds."""
-    value: float
-    """Mean R_cum over rows."""
-    low: float
-    high: float
-    """Lowest and highest end of the rows' 95% intervals."""
-
-    def __str__(self) -> str:
-        return f"{self.policy} ({format_value(self.value)})"
-
-
 _VERDICTS = {1: "Higher", -1: "Lower", 0: "Open, as intervals overlap"}
 
 
@@ -234,43 +213,45 @@ def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> 
     return conclusions + [_quote(estimates) for estimates in all_estimates] or [NO_RESULTS]
 
 
-def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
-    """One summary per policy and checkpoint, in order of first appearance."""
+def _collect_returns(rows: Sequence[ResultRow]) -> list[tuple[int, Interval]]:
+    """Number of training seeds, 0 for a built-in policy, with mean R_cum and ends of all intervals,
+    of each policy and checkpoint; trained and high ones first."""
     groups = grouped(rows, lambda row: (row.method, row.checkpoint))
     policies, returns = [policy for policy, _ in groups], []
     for (policy, checkpoint), group in groups.items():
         name = policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}"
-        seeds = {row.training_seed for row in group}
-        value = sum(row.value for row in group) / len(group)
+        trainings = len({row.training_seed for row in group} - {None})
+        value = summary(row.value for row in group).mean
         lows, highs = zip(*(row.interval for row in group if row.interval), strict=True)
-        returns.append(_Return(name, seeds != {None}, len(seeds), value, min(lows), max(highs)))
-    return returns
+        name += f" ({format_value(value)})"
+        returns.append((trainings, Interval(name, value, min(lows), max(highs))))
+    return sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
 
 
 def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
     """The best trained policy, and how the others compare: all intervals with all intervals."""
-    returns = sorted(_collect_returns(rows), key=lambda own: (-own.trained, -own.value))
-    (best, *others), trained = returns, sum(own.trained for own in returns)
-    if not trained:
-        names = ", ".join(map(str, returns))
+    (trainings, best), *returns = _collect_returns(rows)
+    built_in = sum(not seeds for seeds, _ in returns)
+    if not trainings:
+        names = ", ".join(policy.name for policy in (best, *(policy for _, policy in returns)))
         return f"In {environment}, only built-in policies were evaluated: {names}."
     text = (
-        f"In {environment}, {best} has the highest return per episode of {trained} trained (95% "
-        f"intervals {format_value(best.low)} to {format_value(best.high)}; trainings: "
-        f"{best.trainings})."
+        f"In {environment}, {best.name} has the highest return per episode of "
+        f"{len(returns) + 1 - built_in} trained (95% intervals {format_value(best.low)} to "
+        f"{format_value(best.high)}; trainings: {trainings})."
     )
-    groups = grouped(others, lambda own: _VERDICTS[(own.low > best.high) - (own.high < best.low)])
-    text += "".join(f" {words}: {', '.join(map(str, own))}." for words, own in groups.items())
-    if trained == len(returns):
+    groups = grouped(returns, lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low))
+    for above, policies in groups.items():
+        text += f" {_VERDICTS[above]}: {', '.join(policy.name for _, policy in policies)}."
+    if not built_in:
         text += " No built-in policy (random, logging or best) was evaluated to compare it with."
-    if best.trainings < 2:
+    if trainings < 2:
         text += " It was trained once; the spread over training seeds is unknown."
     return text
 
 
 def _quote(estimates: Estimates) -> str:
     """What `ucfrec ope` concluded of a policy, as its rows say."""
-    for row in estimates.rows:
-        if verdict := row.details.get("verdict"):
-            return f"For {estimates.name}: {verdict}."
-    return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
+    verdicts = filter(None, (row.details.get("verdict") for row in estimates.rows))
+    verdict = next(verdicts, "the rows have no verdict of ucfrec ope")
+    return f"For {estimates.name}: {verdict}."

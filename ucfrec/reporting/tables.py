@@ -37,27 +37,24 @@ class Table:
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """An aligned table for a terminal; the first two columns are left-aligned, others right."""
-    table = [[_format_text(cell) for cell in line] for line in (head, *lines)]
-    widths = [max(len(line[i]) for line in table) for i in range(len(head))]
+    table = [list(map(_format_text, line)) for line in (head, *lines)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     table.insert(1, ["-" * width for width in widths])
-    written = []
-    for line in table:
-        cells = [line[i].ljust(w) if i < 2 else line[i].rjust(w) for i, w in enumerate(widths)]
-        written.append("  ".join(cells).rstrip())
-    return "\n".join(written)
+    form = "  ".join(f"{{:{'<' if i < 2 else '>'}{width}}}" for i, width in enumerate(widths))
+    return "\n".join(form.format(*line).rstrip() for line in table)
 
 
 def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """A table in GitHub Markdown."""
-    body = [[_format_text(cell) for cell in line] for line in (head, ["---"] * len(head), *lines)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in body)
+    table = (head, ["---"] * len(head), *lines)
+    return "\n".join(f"| {' | '.join(map(_format_text, line))} |" for line in table)
 
 
 def evaluation_line(row: ResultRow) -> dict[str, Any]:
     """A row with its values by the column names of tables of evaluations."""
     seeds = {"seed": row.evaluation_seed, "train_seed": row.training_seed}
-    texts = {name: None if seed is None else str(seed) for name, seed in seeds.items()}
-    return {**row.as_line(), "policy": row.method, **texts}
+    texts = {name: str(seed) for name, seed in seeds.items() if seed is not None}
+    return {**row.as_line(), **dict.fromkeys(seeds), "policy": row.method, **texts}
 
 
 def evaluation_table(rows: Iterable[ResultRow]) -> str:
@@ -88,10 +85,10 @@ def mean_and_sd(values: Iterable[float]) -> str:
 
 def format_value(value: Any) -> str:
     """Cell text of `value`: floats with four significant digits, a dash if missing or infinite."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return NONE
-    if isinstance(value, float):
+    if isinstance(value, float) and math.isfinite(value):
         return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+    if value is None or isinstance(value, float):
+        return NONE
     return f"{value:,}" if type(value) is int else str(value)
 
 

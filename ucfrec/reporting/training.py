@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -72,12 +73,10 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
 
 def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
     """The curves to draw: no loss of weight 0, and no total loss that equals a single term."""
-    policy = config["policy"]
-    unused = {loss for loss, weight in _LOSS_WEIGHTS.items() if policy.get(weight) == 0}
-    curves = {name: curve for name, curve in logged.items() if name not in unused}
-    if curves.get("loss") in [curve for name, curve in curves.items() if name != "loss"]:
-        del curves["loss"]
-    return curves
+    weights = config["policy"]
+    curves = {n: curve for n, curve in logged.items() if weights.get(_LOSS_WEIGHTS.get(n)) != 0}
+    total = curves.pop("loss", {})
+    return {**curves, "loss": total} if total and total not in curves.values() else curves
 
 
 def draw_curves(
@@ -91,7 +90,7 @@ def draw_curves(
     """
     scalars = {name for curves in logged for name in curves}
     pictures = []
-    for name in sorted(scalars, key=lambda n: ([*_TITLES, n].index(n), n)):
+    for name in dict.fromkeys((*_TITLES, *sorted(scalars))):
         lines = [
             (names[style], style, curve)
             for style, run in enumerate(logged)
@@ -101,9 +100,9 @@ def draw_curves(
             continue
         title, levels = _TITLES.get(name, name), {}
         if name in ("validation_loss", "action_loss"):
-            first, *further = (references[style] for _, style, _ in lines)
-            if all(losses == first for losses in further):
-                levels = {REFERENCES[key]: first[key] for key in REFERENCES if key in first}
+            losses = [references[style] for _, style, _ in lines]
+            if losses.count(losses[0]) == len(losses):
+                levels = {n: losses[0][key] for key, n in REFERENCES.items() if key in losses[0]}
         steps = sorted({step for _, _, curve in lines for step in curve})
         rows = [(f"{step:g}", [curve.get(step) for _, _, curve in lines]) for step in steps]
         table = Table(title, [run for run, _, _ in lines], rows, "step")
@@ -192,8 +191,8 @@ def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = Fals
         InputError: the file cannot be read as that or lacks the column.
     """
     require_file(path, "name another file")
-    mapped = (log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID for log in logs)
-    names = dict.fromkeys((schema.ITEM_ID, *(name.strip('"') for name in mapped)))
+    mapped = ((log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID).strip('"') for log in logs)
+    names = dict.fromkeys((schema.ITEM_ID, *mapped))
     try:
         texts = dict.fromkeys(names, pa.string()) if text_ids else None
         types = csv.ConvertOptions(column_types=texts)
@@ -203,8 +202,8 @@ def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = Fals
         raise InputError(f"{path} cannot be read as Parquet or CSV: {error}") from None
     column = next((name for name in names if name in table.column_names), None)
     if column is None:
-        wanted = " or ".join(map(repr, names))
-        raise InputError(f"{path} has no column {wanted}; add one with the item ids")
+        heads = " or ".join(map(repr, names))
+        raise InputError(f"{path} has no column {heads}; add one with the item ids")
     return table.rename_columns({column: schema.ITEM_ID})
 
 
@@ -212,30 +211,26 @@ def _item_cells(
     items: pa.Table, numbers: Sequence[int], features: pa.Table | None
 ) -> dict[int, dict[str, str]]:
     """Item number to the cells (column: text) of its row in `items` and of its features."""
-    rows = items.take(pa.array(numbers, pa.int64())).to_pylist()
-    cells = {
-        number: {name: str(value) for name, value in row.items()}
-        for number, row in zip(numbers, rows, strict=True)
-    }
+    rows = items.take(pa.array(numbers, pa.int64()))
+    cells = [{name: str(value) for name, value in row.items()} for row in rows.to_pylist()]
     if features is not None:
-        ids = pa.array([row[schema.ITEM_ID] for row in rows])
-        try:
-            matches = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids)).to_pylist()
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, TypeError):
-            matches = []  # the ids are of another type, so none of them can match
-        described = {row.pop(schema.ITEM_ID): _describe_item(row) for row in matches}
-        for number, row in zip(numbers, rows, strict=True):
-            cells[number]["features"] = described.get(row[schema.ITEM_ID], "–")
-    return cells
+        ids, texts = rows[schema.ITEM_ID].combine_chunks(), {}
+        # Where the ids are of another type, none of them can match.
+        with suppress(pa.ArrowInvalid, pa.ArrowNotImplementedError, TypeError):
+            matches = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids))
+            texts = {row.pop(schema.ITEM_ID): _describe_item(row) for row in matches.to_pylist()}
+        for row, item_id in zip(cells, ids.to_pylist(), strict=True):
+            row["features"] = texts.get(item_id, "–")
+    return dict(zip(numbers, cells, strict=True))
 
 
 def _describe_item(features: Mapping[str, Any]) -> str:
     """Text of the features that are neither missing nor zero, cut to `_MOST_CHARACTERS`."""
-    parts = []
-    for name, value in features.items():
-        if value:
-            values = value if isinstance(value, list) else [value]
-            parts.append(f"{name} {', '.join(map(format_value, values))}")
+    parts = (
+        f"{name} {', '.join(map(format_value, value if isinstance(value, list) else [value]))}"
+        for name, value in features.items()
+        if value
+    )
     text = "; ".join(parts) or "–"
     return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 1]}…"
 
@@ -244,10 +239,10 @@ def _tabulate_session(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
+    logged = items[session["logged"]]
     body = [("shown before", [reward, *items[item].values()]) for item, reward in history]
-    body.append(("shown next in the log", [None, *items[session["logged"]].values()]))
+    body.append(("shown next in the log", [None, *logged.values()]))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""
         body.append((f"recommended {rank}{again}", [None, *items[item].values()]))
-    columns = ["reward", *items[session["logged"]]]
-    return Table(f"Held-out session {number}", columns, body)
+    return Table(f"Held-out session {number}", ["reward", *logged], body)

@@ -3,7 +3,7 @@ of JSON in files that several processes may append to, and a table in Python."""
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from annotated_types import Ge, Lt
-from pydantic import AfterValidator, AllowInfNan, ConfigDict, Strict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 from ucfrec.errors import InputError
 from ucfrec.files import atomic
@@ -20,10 +20,6 @@ from ucfrec.files import atomic
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-
-Text = Annotated[str, Strict()]
-Number = Annotated[float, Strict(), AllowInfNan(False)]
-Whole = Annotated[int, Strict()]
 
 
 def plain(value: Any) -> Any:
@@ -44,36 +40,36 @@ def _finite(value: Any) -> Any:
 
 
 Json = Annotated[Any, AfterValidator(_finite)]
-Seed = Annotated[int, Strict(), Ge(0), Lt(2**63)]
-Scalar = Text | Annotated[bool, Strict()] | Whole | Number | None
+Seed = Annotated[int, Ge(0), Lt(2**63)]
+Scalar = str | bool | int | float | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
     """Identifies a measurement; rows with equal keys are of the same one."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid")
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-    suite: Text
+    suite: str
     """Benchmark suite or command, e.g. recommendation, control, evaluate, off-policy."""
-    table: Text
+    table: str
     """Table of the suite."""
-    task: Text
+    task: str
     """Benchmark task or data file: the training data and the environment of the evaluation."""
-    method: Text
+    method: str
     """Row of the table."""
-    policy: Text
+    policy: str
     """Policy that `method` uses: a trained one by its kind, or a built-in one of an environment."""
     training_seed: Seed | None = None
     log_seed: Seed | None = None
     """Seed of simulated logs; None for real logs."""
     evaluation_seed: Seed | None = None
     """Seed of the evaluated episodes; the same for every training seed."""
-    conditions: Mapping[Text, Scalar] = field(default_factory=dict)
+    conditions: Mapping[str, Scalar] = field(default_factory=dict)
     """Other settings of the measurement: budget, episodes, distractor, …"""
-    config_hash: Text | None = None
+    config_hash: str | None = None
     """Hash of the training configuration, which the run's record holds."""
-    data_fingerprint: Text | None = None
+    data_fingerprint: str | None = None
     """Fingerprint of the store."""
 
     def covers(self, row: "ResultRow") -> bool:
@@ -91,29 +87,29 @@ _KEY_FIELDS: Final = tuple(f.name for f in fields(RowKey) if f.name != "conditio
 class ResultRow(RowKey):
     """One measurement and its numbers; a line of a file of result rows is its `to_json`."""
 
-    metric: Text
+    metric: str
     """Name of the metric that tables show."""
-    metrics: Mapping[Text, Number]
+    metrics: Mapping[str, float]
     """Name to finite number, of the measured metrics only."""
-    interval: tuple[Number, Number] | None = None
+    interval: tuple[float, float] | None = None
     """95% interval of the value of `metric`, over episodes."""
-    environment: Text | None = None
+    environment: str | None = None
     """Simulator of the evaluation."""
-    checkpoint: Text | None = None
+    checkpoint: str | None = None
     """Evaluated weights, e.g. "best" or "last"."""
-    target_return: Number | None = None
+    target_return: float | None = None
     """Target return of the evaluation, in reward units."""
-    rule: Text | None = None
+    rule: str | None = None
     """How the policy acts and how its target return was chosen, in words."""
-    details: Mapping[Text, Json] = field(default_factory=dict)
+    details: Mapping[str, Json] = field(default_factory=dict)
     """JSON values other than metrics, e.g. the screening result of each dimension."""
-    wall_time_s: Number | None = None
+    wall_time_s: float | None = None
     """Wall time of the evaluation in seconds; that of the training is `train_wall_time_s`."""
-    peak_memory_mib: Number | None = None
+    peak_memory_mib: float | None = None
     """Peak resident memory of the process during the measurement, in MiB."""
-    command: Text = ""
-    commit: Text | None = None
-    versions: Mapping[Text, Text] = field(default_factory=dict)
+    command: str = ""
+    commit: str | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def value(self) -> float:
@@ -150,35 +146,28 @@ class ResultRow(RowKey):
 
     def to_json(self) -> dict[str, Any]:
         """The row as JSON values, without fields at their default."""
-        written = {name: v for name, v in vars(self).items() if v not in (None, "", {})}
-        if self.interval is not None:
-            written["interval"] = list(self.interval)
-        return written
+        return {name: value for name, value in vars(self).items() if value not in (None, "", {})}
 
 
 _NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
 _ROWS: Final = TypeAdapter(ResultRow)
 
 
-def row_from_json(
-    value: Any, where: str, validate: Callable[[Any], ResultRow] = _ROWS.validate_python
-) -> ResultRow:
-    """Inverse of `ResultRow.to_json`; messages name the origin `where` (file and line).
+def row_from_json(text: str, where: str) -> ResultRow:
+    """Inverse of `ResultRow.to_json`, of JSON; messages name the origin `where` (file and line).
 
     Raises:
-        InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
+        InputError: `text` is no object, or a field is missing, unknown or of a wrong type.
     """
     try:
-        row = validate(value)
-        fault = "" if row.metric in row.metrics else f"its metrics lack {row.metric!r:.60}"
+        row = _ROWS.validate_json(text)
+        if row.metric in row.metrics:
+            return row
+        fault = f"its metrics lack {row.metric!r:.60}"
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         fault = f"{'.'.join(map(str, first['loc']))!r:.60}: {first['msg']}"
-    except RecursionError:
-        fault = "it is nested too deeply"
-    if fault:
-        raise InputError(f"{where} is not a result row: {fault}; delete it, or name another file")
-    return row
+    raise InputError(f"{where} is not a result row: {fault}; delete it, or name another file")
 
 
 def read_rows(path: Path) -> list[ResultRow]:
@@ -187,10 +176,9 @@ def read_rows(path: Path) -> list[ResultRow]:
     Raises:
         InputError: a line is not a result row, or the file is not UTF-8 text.
     """
-    lines = enumerate(_read_text(path).split("\n"), start=1)
     return [
-        row_from_json(line, f"{path}, line {number}", _ROWS.validate_json)
-        for number, line in lines
+        row_from_json(line, f"{path}, line {number}")
+        for number, line in enumerate(_read_text(path).split("\n"), start=1)
         if line.strip()
     ]
 
@@ -201,16 +189,14 @@ def read_results(path: Path) -> list[ResultRow]:
     Raises:
         InputError: the file is missing or has other content.
     """
-    if path.suffix != ".json":
-        if not path.exists():
-            raise InputError(f"{path} does not exist; check the path")
-        with path.open("rb") as file:
-            if file.read(1) != b"[":
-                return read_rows(path)
+    if path.suffix != ".json" and path.exists() and not _read_text(path).startswith("["):
+        return read_rows(path)
     rows = atomic.read_json(path)
     if not isinstance(rows, list):
         raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
-    return [row_from_json(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
+    return [
+        row_from_json(json.dumps(row), f"{path}, row {n}") for n, row in enumerate(rows, start=1)
+    ]
 
 
 def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
@@ -307,9 +293,7 @@ class ResultTable:
 
         lines = []
         for row in self.rows:
-            intervals = {**row.details.get("intervals", {})}
-            if row.interval is not None:
-                intervals[row.metric] = row.interval
+            intervals = {row.metric: row.interval, **row.details.get("intervals", {})}
             line: dict[str, Any] = {"method": row.method}
             for name, value in row.metrics.items():
                 line[name] = value

@@ -27,7 +27,7 @@ class Summary:
     @property
     def standard_error(self) -> float:
         """Standard error of the mean, sd / √n; NaN for fewer than two values."""
-        return float(self.sd / np.sqrt(self.count)) if self.count else float("nan")
+        return float(self.sd / np.sqrt(self.count))
 
 
 def summary(values: Iterable[float]) -> Summary:
@@ -55,14 +55,6 @@ def effective_number(weights: Float64Array) -> float:
     return float(shares.sum() ** 2 / (shares**2).sum())
 
 
-def average_ranks(values: Array) -> Float64Array:
-    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean, as by
-    `scipy.stats.rankdata`, which takes a second to import."""
-    _, level, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ranks: Float64Array = (counts.cumsum() - (counts - 1) / 2)[level]
-    return ranks
-
-
 def group_auc(
     scores: Float64Array, liked: BoolArray, owner: Array, n_users: int
 ) -> tuple[Float64Array, Float64Array]:
@@ -75,10 +67,10 @@ def group_auc(
         scores: (N,) of the shown items, which are `liked` (N,) or not.
         owner: (N,) user of each step, 0 to n_users − 1.
     """
+    import pandas as pd
+
     sizes = np.bincount(owner, minlength=n_users)
-    _, level = np.unique(scores, return_inverse=True)
-    # Ranks within users: ranks of (user, score) minus the number of steps of earlier users.
-    ranks = average_ranks(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
+    ranks = pd.Series(scores).groupby(owner).rank().to_numpy()
     positive = np.bincount(owner, liked, minlength=n_users)
     negative = sizes - positive
     above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2
@@ -87,15 +79,6 @@ def group_auc(
         auc = np.where(mixed, above / (positive * negative), 0.0)
     weight = (sizes * mixed).astype(np.float64)
     return auc * weight, weight
-
-
-def ratio_with_error(above: Float64Array, below: Float64Array) -> tuple[float, float]:
-    """Σ above / Σ below over users (U,), and its standard error by linearisation; NaN for 0 / 0."""
-    total = below.sum()
-    if total == 0:
-        return float("nan"), float("nan")
-    ratio = above.sum() / total
-    return float(ratio), float(np.sqrt(np.square(above - ratio * below).sum()) / total)
 
 
 def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:

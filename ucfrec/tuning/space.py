@@ -3,16 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
+
+from optuna import Trial
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import TABLES, Config, resolve_config
-
-if TYPE_CHECKING:
-    from optuna import Trial
 
 POLICY: Final = "policy"
 """Name of the choice among policies; settings have a dot."""
@@ -34,16 +33,15 @@ class Dimension:
     """Whether the range is searched in powers."""
 
     def __post_init__(self) -> None:
-        if bool(self.choices) == (self.low is not None and self.high is not None):
-            raise InputError("give a list of choices, or low and high")
-        low, high = self.low or 0.0, self.high or 0.0
-        if not self.choices and (low >= high or (self.log and low <= 0)):
+        low, high = self.low, self.high
+        is_range = low is not None and high is not None and low < high and (low > 0 or not self.log)
+        if bool(self.choices) == is_range:
             raise InputError(
-                f"low is {low:g} and high {high:g}; give the lower one first, above 0 with log = "
-                "true"
+                "give a list of choices, or low and high; give the lower one first, above 0 with "
+                "log = true"
             )
 
-    def suggest(self, trial: "Trial", name: str) -> Value:
+    def suggest(self, trial: Trial, name: str) -> Value:
         """The value of this setting in a trial."""
         if self.choices:
             return cast(Value, trial.suggest_categorical(name, self.choices))
@@ -102,15 +100,14 @@ def read_space(path: Path) -> Space:
         if table not in TABLES or not isinstance(fields, dict):
             raise InputError(f"{path}: no table is called {table!r}; use {', '.join(TABLES)}")
         for field, values in fields.items():
-            name, listed = f"{table}.{field}", not isinstance(values, dict)
+            is_range, name = isinstance(values, dict), f"{table}.{field}"
             try:
-                space[name] = Dimension(tuple(values)) if listed else Dimension(**values)
-            except TypeError:
+                space[name] = Dimension(**values) if is_range else Dimension(tuple(values))
+            except (TypeError, InputError):
                 raise InputError(
-                    f"{path}: {name}: write a list of choices, or {{low = …, high = …, log = true}}"
+                    f"{path}: {name}: write a list of choices, or {{low = …, high = …}}, the lower "
+                    "one first, and log = true only above 0"
                 ) from None
-            except InputError as error:
-                raise InputError(f"{path}: {name}: {error}") from None
     return space
 
 
@@ -159,7 +156,7 @@ class Search:
             config = replace(config, train=shorter)
         return config
 
-    def suggest(self, trial: "Trial") -> tuple[str, dict[str, Value]]:
+    def suggest(self, trial: Trial) -> tuple[str, dict[str, Value]]:
         """The policy and settings of a trial."""
         policy = self.policies[0]
         if len(self.policies) > 1:

@@ -12,10 +12,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import optuna
 import torch
+from optuna import Study, Trial, TrialPruned
+from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
@@ -32,10 +36,6 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
-if TYPE_CHECKING:
-    from optuna import Study, Trial
-    from optuna.trial import FrozenTrial
-
 VALUE: Final = "value"
 METRICS: Final = {
     VALUE: "return of a session in the user model, under the decision rule that training selects",
@@ -44,7 +44,10 @@ METRICS: Final = {
     "validation rows",
 }
 _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
-_OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
+_NO_VALUE: Final = (
+    "has no estimated value, because its decision rule is not selected in simulated sessions; use "
+    "--metric ndcg or gauc"
+)
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
 _REMEDY: Final = "restore it, or name another folder"
@@ -61,10 +64,7 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
     if metric == VALUE:
         rule = trained.record.rule
         if rule is None or rule.estimate is None:
-            raise InputError(
-                "the decision rule of this training is not selected in simulated sessions, so "
-                f"there is no estimated value; {_OTHER_METRICS}"
-            )
+            raise InputError(f"this training {_NO_VALUE}")
         return rule.estimate.value
     validation = store.split("validation")
     users = validation.episode_values(schema.USER)
@@ -96,7 +96,7 @@ class Plan:
     """Whether trials are ended early whose validation loss is above the median of the others'."""
 
 
-def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
+def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
@@ -114,10 +114,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
         config = plan.search.config(policy, {})
         returns = config.policy.returns(store.record.source.session_by)
         if not (store.has_items and config.rule.choose and returns.per_session):
-            raise InputError(
-                f"{store.path}: {policy} has no estimated value there, because its decision rule "
-                f"is not selected in simulated sessions; {_OTHER_METRICS}"
-            )
+            raise InputError(f"{store.path}: {policy} {_NO_VALUE}")
     with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
         with damage_explained(plan.out / STUDY, _REMEDY):
             _require_same(study, plan, store)
@@ -133,34 +130,23 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
                 with block_ctrl_c():
                     results = pool.map(partial(_run_trials, plan), shares, seeds)
                 list(results)
-        _keep_best(study, plan)
-        _write_report(study, plan)
+        _write_report(study, plan, _keep_best(study, plan))
     return study
 
 
-def list_finished(study: "Study") -> "list[FrozenTrial]":
+def list_finished(study: Study) -> list[FrozenTrial]:
     """The trials that were measured or ended early."""
-    return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-
-
-def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
-    """The configuration of a trial."""
-    values = dict(trial.params)
-    policy = values.pop(POLICY, plan.search.policies[0])
-    return plan.search.config(policy, values)
+    return study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
 
 
 @contextmanager
-def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
+def _open_study(folder: Path, seed: int = 0) -> Iterator[Study]:
     """The study of a folder, new if it has none, while it is used; errors of its file become an
     `InputError`.
 
     Args:
         seed: of what its trials draw.
     """
-    import optuna
-    from sqlalchemy.exc import SQLAlchemyError
-
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     folder.mkdir(parents=True, exist_ok=True)
@@ -186,17 +172,17 @@ def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
         ) from None
 
 
-def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
+def _require_same(study: Study, plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
-    own: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
+    searched: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
     for policy in search.policies:
-        own[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
+        searched[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
     identity = {
         "store": store.record.fingerprint,
         "metric": plan.metric,
         "k": plan.k,
-        "search": config_hash(own),
+        "search": config_hash(searched),
     }
     earlier = study.user_attrs.get("about")
     if earlier is None:
@@ -209,22 +195,16 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
         )
 
 
-def _enqueue_again(study: "Study") -> None:
+def _enqueue_again(study: Study) -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
-    from optuna.trial import TrialState
-
-    for trial in study.trials:
-        if trial.state == TrialState.RUNNING:
-            study.tell(trial.number, state=TrialState.FAIL)
-            if trial.params:
-                study.enqueue_trial(trial.params)
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)
+        if trial.params:
+            study.enqueue_trial(trial.params)
 
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
-    from optuna import TrialPruned
-    from optuna.trial import TrialState
-
     store = EpisodeStore.open(plan.store)
     # With the seed of the search, one that goes on would draw the first points once more.
     with _open_study(plan.out, seed) as study:
@@ -239,15 +219,22 @@ def _run_trials(plan: Plan, count: int, seed: int) -> None:
                 study.tell(trial, state=TrialState.FAIL)
 
 
-def _measure_trial(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
+def _measure_trial(plan: Plan, store: EpisodeStore, trial: Trial) -> float:
     """The metric of a trial, whose run is deleted unless it is the best."""
-    from optuna import TrialPruned
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
-        if plan.prune and "validation_loss" in logged:
-            trial.report(logged["validation_loss"], step)
-            if _is_hopeless(trial.study, trial.number, policy):
-                raise TrialPruned
+        """End the trial where its loss is above the median of the others of its policy, as losses
+        of different policies are not of the same quantity."""
+        if not plan.prune or (loss := logged.get("validation_loss")) is None:
+            return
+        losses = [
+            earlier.intermediate_values[step]
+            for earlier in trial.study.get_trials(deepcopy=False)
+            if earlier.user_attrs.get(POLICY) == policy and step in earlier.intermediate_values
+        ]
+        trial.report(loss, step)
+        if len(losses) >= _COMPARED and loss > np.median(losses):
+            raise TrialPruned
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
@@ -270,47 +257,31 @@ def _name_run(plan: Plan, config: Config) -> Path:
     return plan.out / f"{TRIAL}{config_hash(asdict(config))}"
 
 
-def _list_values(study: "Study") -> list[float]:
+def _list_values(study: Study) -> list[float]:
     """The metric of each trial that was measured."""
-    trials = (trial for trial in study.trials if trial.state.name == "COMPLETE")
-    return [trial.value for trial in trials if trial.value is not None]
+    return [trial.values[0] for trial in study.get_trials(states=(TrialState.COMPLETE,))]
 
 
-def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
-    """Whether its loss is above the median of earlier trials of its policy at that step."""
-    trials = study.get_trials(deepcopy=False)
-    curve = trials[number].intermediate_values
-    step = max(curve)
-    # Losses of different policies are not of the same quantity.
-    losses = [
-        trial.intermediate_values[step]
-        for trial in trials
-        if trial.number != number
-        and trial.user_attrs.get(POLICY) == policy
-        and step in trial.intermediate_values
-    ]
-    return len(losses) >= _COMPARED and curve[step] > float(np.median(losses))
-
-
-def _keep_best(study: "Study", plan: Plan) -> None:
-    """Move the best run to its place and delete those of the other trials."""
+def _keep_best(study: Study, plan: Plan) -> Config:
+    """Move the best run to its place and delete the others; returns its configuration."""
     if not _list_values(study):
-        errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
+        errors = (t.user_attrs["error"] for t in study.trials if "error" in t.user_attrs)
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
-    run = _name_run(plan, config_of(plan, study.best_trial))
+    values = study.best_params
+    config = plan.search.config(values.pop(POLICY, plan.search.policies[0]), values)
+    run = _name_run(plan, config)
     if run.is_dir():
         shutil.rmtree(plan.out / BEST, ignore_errors=True)
         run.rename(plan.out / BEST)
     for folder in plan.out.glob(f"{TRIAL}*"):
         shutil.rmtree(folder, ignore_errors=True)
+    return config
 
 
-def importances(study: "Study") -> dict[str, float]:
+def importances(study: Study) -> dict[str, float]:
     """Share of the metric's variance that each setting of all trials explains (fANOVA: Hutter et
     al., ICML 2014), most important first; empty with fewer than four trials that differ."""
-    import optuna
-
     if len(set(_list_values(study))) < 4:
         return {}
     try:
@@ -320,17 +291,17 @@ def importances(study: "Study") -> dict[str, float]:
         return {}
 
 
-def _write_report(study: "Study", plan: Plan) -> None:
+def _write_report(study: Study, plan: Plan, config: Config) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
-    config, file = config_of(plan, study.best_trial), plan.out / BEST_TOML
+    file = plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
     if "train.steps" in names:
         names.add("train.warmup_steps")
     chosen, tables = asdict(config), dict[str, str]()
     for name in sorted({*plan.search.fixed, *names}):
         table, _, field = name.partition(".")
-        value = chosen[table][field] if name in names else plan.search.fixed[name]
-        tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
+        tables.setdefault(table, f"\n[{table}]\n")
+        tables[table] += f"{field} = {format_toml(chosen[table][field])}\n"
     options = ("--policy", config.policy_name, "--config", str(file), "--out", "RUN")
     command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
     head = (
@@ -357,7 +328,7 @@ def _write_report(study: "Study", plan: Plan) -> None:
         scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def _tabulate_trials(study: "Study", metric: str) -> str:
+def _tabulate_trials(study: Study, metric: str) -> str:
     """The trials, best first; those without a value last."""
     trials = [trial for trial in study.trials if trial.state.is_finished()]
     trials.sort(key=lambda t: (t.state.name != "COMPLETE", -(t.value or 0.0)))

@@ -23,7 +23,12 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number, ratio_with_error
-from ucfrec.user_model.reward_report import draw_steps, number_users, read_propensities
+from ucfrec.user_model.reward_report import (
+    draw_episodes,
+    draw_steps,
+    number_users,
+    read_propensities,
+)
 
 SHOWN = 10
 """Items that a rule shows at a step."""
@@ -86,9 +91,7 @@ class LoggedEvidence:
 
     def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
         """Draws about `most` steps of whole sessions of a view."""
-        order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
-        last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
-        view = view.select(np.sort(order[: last + 1]))
+        view = view.select(np.sort(draw_episodes(view, most, [seed, 7])))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
         self.propensities = read_propensities(view, episodes, steps)
@@ -148,11 +151,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     def rank(weights: Sequence[float]) -> RankedRule:
         rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
-        tops = [list[Tensor]() for _ in rules]
-        for _, n, scores in logged.score(rules):
-            tops[n].append(best_items(scores, min(SHOWN, n_items)))
-        for rule, parts in zip(rules, tops, strict=True):
-            top = torch.cat(parts).numpy()
+        tops = np.zeros((len(rules), len(logged.steps), min(SHOWN, n_items)), dtype=np.int64)
+        for part, n, scores in logged.score(rules):
+            tops[n, part] = best_items(scores, tops.shape[2]).numpy()
+        for rule, top in zip(rules, tops, strict=True):
             hits = (top == logged.items[:, None]).any(1)
             # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.
             ahead = (hits.astype(np.float64) - baseline) * logged.liked

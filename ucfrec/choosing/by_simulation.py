@@ -225,11 +225,9 @@ class RuleSearch:
                     live = live[going]
                     actor.keep(going)
         numbers, items = np.concatenate(decisions).T
-        outcomes = dict[DecisionRule, Outcomes]()
-        for number, rule in enumerate(rules):
-            part = slice(number * n, (number + 1) * n)
-            outcomes[rule] = Outcomes(returns[part], lengths[part], items[numbers // n == number])
-        return outcomes
+        shown = [items[numbers // n == number] for number in range(len(rules))]
+        parts = zip(returns.reshape(-1, n), lengths.reshape(-1, n), shown, strict=True)
+        return dict(zip(rules, map(Outcomes._make, parts), strict=True))
 
     def _summarise(self, rule: DecisionRule) -> SimulatedRule:
         sessions = self._sessions[rule]
@@ -252,21 +250,19 @@ class RuleSearch:
         """Whether the log supports what the candidate did, and can evaluate it."""
         if not self.least_users or not self.is_supported(candidate):
             return self.is_supported(candidate)
-        evidence = candidate.evidence
-        if evidence is None or evidence.spread > _WIDEST:
-            return False
-        return candidate.effective_users >= self.least_users
+        is_narrow = candidate.evidence is not None and candidate.evidence.spread <= _WIDEST
+        return is_narrow and candidate.effective_users >= self.least_users
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
+        allowed = [*filter(self.is_allowed, candidates)]
+        return allowed or [*filter(self.is_supported, candidates)]
 
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
         """The best, the start, and allowed ones of the highest value, in more sessions."""
-        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        ranked = (best, *self._find_start(candidates), *sorted(allowed, key=_value, reverse=True))
+        allowed = sorted(filter(self.is_allowed, candidates), key=_value, reverse=True)
+        ranked = (best, *self._find_start(candidates), *allowed)
         rules = dict.fromkeys(candidate.rule for candidate in ranked)
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
@@ -302,8 +298,8 @@ class RuleSearch:
         in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
-        unknown = [candidate for candidate in level if candidate.evidence is None]
-        complete = [candidate for candidate in level if candidate not in unknown]
+        unknown = [candidate for candidate in level if not candidate.evidence]
+        complete = [candidate for candidate in level if candidate.evidence]
 
         def rank(candidate: SimulatedRule) -> tuple[float, ...]:
             evidence, users = candidate.evidence, candidate.effective_users
@@ -517,11 +513,9 @@ def find_neighbours(
         grid["tag_run"] = [0, *config.tag_runs] if problem.users.fatigue else [0]
     for name, values in grid.items():
         value = getattr(rule, name)
-        smaller = [candidate for candidate in values if candidate < value]
-        larger = [candidate for candidate in values if candidate > value]
-        for neighbour in (*sorted(smaller)[-1:], *sorted(larger)[:1]):
-            changed: dict[str, Any] = {name: neighbour}
-            yield replace(rule, **changed)
+        smaller = sorted(candidate for candidate in values if candidate < value)
+        larger = sorted(candidate for candidate in values if candidate > value)
+        yield from _vary(rule, **{name: [*smaller[-1:], *larger[:1]]})
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:

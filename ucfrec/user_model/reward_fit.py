@@ -36,6 +36,7 @@ from ucfrec.user_model.reward_report import (
     ItemRewardReport,
     Line,
     RewardRows,
+    draw_episodes,
     fit_line,
     weigh_by_propensity,
 )
@@ -197,9 +198,7 @@ def fit_training_users(
 
 def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:
     """The training sessions, in an order drawn by `seed`; of many, the first 100,000 steps."""
-    order = np.random.default_rng([seed, 5]).permutation(train.n_episodes)
-    last = int(np.searchsorted(np.cumsum(train.lengths[order]), _MAX_STEPS))
-    return train.select(order[: last + 1])
+    return train.select(draw_episodes(train, _MAX_STEPS, [seed, 5]))
 
 
 def set_statistics(

@@ -79,6 +79,13 @@ def draw_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, Int
     return view.locate(draw_numbers(view.n_steps, limit, seed))
 
 
+def draw_episodes(view: EpisodeStore, most: int, seed: int | list[int]) -> IntArray:
+    """Positions of episodes of a view in a drawn order; of many, the first with `most` steps."""
+    order = np.random.default_rng(seed).permutation(view.n_episodes)
+    last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
+    return order[: last + 1]
+
+
 def draw_numbers(count: int, limit: int, seed: int) -> IntArray:
     """The numbers below `count`; of more than `limit`, so many drawn."""
     if count <= limit:

@@ -138,11 +138,10 @@ class SessionEnd:
         parts = {}
         if "thresholds" in tensors:
             parts["inputs"] = inputs = tensors["inputs"]
-            if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
-                raise ValueError("inputs are not numbers of inputs")
-            if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
-                raise ValueError("inputs are beyond the last input")
             trees, splits = inputs.shape
+            is_beyond = bool(((inputs < 0) | (inputs >= _INPUTS)).any())
+            if is_beyond or splits > _SPLITS or inputs.dtype != torch.int64:
+                raise ValueError("inputs are beyond the last input")
             shapes = {"thresholds": (trees, splits), "leaves": (trees, 2**splits), "base": ()}
         for name, shape in shapes.items():
             parts[name] = tensors[name]

@@ -106,10 +106,10 @@ def test_scores_in_memory_do_not_grow_with_the_catalogue(
         return score(scorer, query, **options)
 
     monkeypatch.setattr(Scorer, "scores_of", score_and_count)
-    expected = chosen(folder, 50.0, 0.0, 1.0).list_candidates()
+    expected = chosen(folder, 50.0, 0.0, 1.0)
     monkeypatch.setattr(by_ranking, "_SCORES_AT_ONCE", 24 * 3)
     rows.clear()
-    assert chosen(folder, 50.0, 0.0, 1.0).list_candidates() == expected
+    assert chosen(folder, 50.0, 0.0, 1.0) == expected
     assert max(rows) == 3
     parts = [[(0, slice(0, 2))], [(0, slice(2, 3))], [(2, slice(3, 5))]]
     assert _batch_rules(np.array([0, 0, 0, 2, 2]), 2) == parts

@@ -14,11 +14,9 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.session_end import (
-    BoostedTrees,
     LoggedEnds,
     SessionEnd,
     describe_steps,
-    fit_trees,
     whole_sessions,
 )
 
@@ -223,17 +221,3 @@ def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
     # The last step of a session that is cut tells nothing.
     assert rewards.tolist() == np.delete(np.arange(n), cut).tolist()
     np.testing.assert_array_equal(known.ended, np.isin(rewards, np.cumsum(lengths) - 1))
-
-
-def test_another_value_of_one_input_is_as_if_it_were_there() -> None:
-    rng = np.random.default_rng(0)
-    inputs = rng.integers(4, size=(2000, 3)).astype(np.float64)
-    trees = BoostedTrees(**fit_trees(inputs, (inputs.sum(1) + rng.normal(size=2000)) > 5, 0))
-    given, other = torch.from_numpy(inputs), torch.from_numpy(rng.integers(4, size=2000))
-    for number in range(3):
-        changed = given.clone()
-        changed[:, number] = other
-        odds = trees.replace_input(given, number, [other, given[:, number]])
-        assert torch.equal(odds[0], trees(changed))
-        assert torch.equal(odds[1], trees(given))
-        assert not torch.equal(*odds)

@@ -7,6 +7,7 @@ than the ten most liked ones do, by a standard error.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -21,8 +22,13 @@ from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.processes import progress
-from ucfrec.results.statistics import effective_number
-from ucfrec.user_model.reward_report import draw_steps, number_users, read_propensities
+from ucfrec.results.statistics import effective_number, ratio_with_error
+from ucfrec.user_model.reward_report import (
+    draw_episodes,
+    draw_steps,
+    number_users,
+    read_propensities,
+)
 
 SHOWN = 10
 """Items that a rule shows at a step."""
@@ -58,28 +64,26 @@ class LoggedScores:
     def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, int, Tensor]]:
         """Of batches of the steps, scores (B, n_items) by each rule: steps, rule, scores."""
         scorers = [self._scorer.under(rule) for rule in rules]
-        reach, widest = max((scorer.reach, number) for number, scorer in enumerate(scorers))
+        widest = max(scorers, key=attrgetter("reach"))
         weighted = any(rule.reward_weight for rule in rules)
         with progress(len(self.steps), "logged steps under each rule", "rows") as bar:
             n_items = len(self.view.item_states.embeddings)
             at_once = max(1, min(_AT_ONCE, _SCORES_AT_ONCE // n_items))
             for first in range(0, len(self.steps), at_once):
-                part = slice(first, min(first + at_once, len(self.steps)))
+                part = slice(first, first + at_once)
                 episodes, steps = self.episodes[part], self.steps[part]
                 queries = self._queries if self._scorer.has_factors else {}
                 sessions: Sessions | None = None
                 for number, (rule, scorer) in enumerate(zip(rules, scorers, strict=True)):
-                    key = first, rule.target, rule.minimum_target, reach, weighted
+                    key = first, rule.target, rule.minimum_target, widest.reach, weighted
                     if key not in queries:
-                        sessions = sessions or sessions_before(
-                            scorers[widest], self.view, episodes, steps
-                        )
+                        sessions = sessions or sessions_before(widest, self.view, episodes, steps)
                         query = scorer.query(sessions, rewards=weighted)
                         # What has been read for the query is not needed again.
                         queries[key] = query._replace(sessions=replace(sessions, states=None))
                     seen = seen_before(self.view, episodes, steps) if rule.exclude_seen else None
                     yield part, number, scorer.scores_of(queries[key], excluded=seen)
-                bar.update(part.stop - part.start)
+                bar.update(len(steps))
 
 
 class LoggedEvidence:
@@ -87,9 +91,7 @@ class LoggedEvidence:
 
     def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
         """Draws about `most` steps of whole sessions of a view."""
-        order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
-        last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
-        view = view.select(np.sort(order[: last + 1]))
+        view = view.select(np.sort(draw_episodes(view, most, [seed, 7])))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
         self.propensities = read_propensities(view, episodes, steps)
@@ -117,16 +119,15 @@ class LoggedEvidence:
             return Evidence(rate, likelihood)
         sums = np.bincount(self._logged.episodes, logs - np.log(self.propensities))
         weights = np.exp(np.minimum(sums, 100.0))
-        above = np.bincount(self._users, weights * view.returns.astype(np.float64))
+        above = np.bincount(self._users, weights * view.returns).astype(np.float64)
         below = np.bincount(self._users, weights).astype(np.float64)
         if not below.any():
             return Evidence(rate, likelihood, 0.0)
         halves = [half for half in (below[::2], below[1::2]) if len(half)]
         effective_users = 2 * min(effective_number(half) for half in halves)
         spread = float(sums[np.isfinite(sums)].var())
-        value = above.sum() / below.sum()
-        error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return Evidence(rate, likelihood, effective_users, spread, float(value), float(error))
+        value, error = ratio_with_error(above, below)
+        return Evidence(rate, likelihood, effective_users, spread, value, error)
 
 
 def choose_by_ranking(problem: Problem) -> RuleChoice:
@@ -150,11 +151,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     def rank(weights: Sequence[float]) -> RankedRule:
         rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
-        tops = [list[Tensor]() for _ in rules]
-        for _, n, scores in logged.score(rules):
-            tops[n].append(best_items(scores, min(SHOWN, n_items)))
-        for rule, parts in zip(rules, tops, strict=True):
-            top = torch.cat(parts).numpy()
+        tops = np.zeros((len(rules), len(logged.steps), min(SHOWN, n_items)), dtype=np.int64)
+        for part, n, scores in logged.score(rules):
+            tops[n, part] = best_items(scores, tops.shape[2]).numpy()
+        for rule, top in zip(rules, tops, strict=True):
             hits = (top == logged.items[:, None]).any(1)
             # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.
             ahead = (hits.astype(np.float64) - baseline) * logged.liked
@@ -173,7 +173,7 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
         by_weight = {candidate.rule.reward_weight: candidate for candidate in ranked}
-        nearest = min((other for other in by_weight if other > weight), default=weight)
+        nearest = min((larger for larger in by_weight if larger > weight), default=weight)
         if by_weight[nearest].overlaps:
             break
         best = rank([(weight + nearest) / 2])

@@ -9,7 +9,7 @@ also leave enough effective users to evaluate it off-policy.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby, product
+from itertools import product
 from operator import attrgetter
 from statistics import median_high
 from typing import Any, Final, NamedTuple
@@ -84,7 +84,6 @@ class _ManyRules(PolicyActor):
         users = np.arange(len(states.user_features))
         super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
         self._scorers = scorers
-        self._targets = [(each.rule.target, each.rule.minimum_target) for each in scorers]
         self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
         self._rule = np.repeat(np.arange(len(scorers)), n)
 
@@ -98,12 +97,8 @@ class _ManyRules(PolicyActor):
         decisions = []
         most = max(1, _SCORES_AT_ONCE // self._n_items)
         for batch in _batch_rules(self._rule[rows.numpy()], most):
-            begin, windows = batch[0][1].start, list[Windows]()
-            # Windows depend on the rule's targets alone.
-            for _, rules in groupby(batch, lambda entry: self._targets[entry[0]]):
-                (number, part), *others = rules
-                end = others[-1][1].stop if others else part.stop
-                windows.append(self._scorers[number].windows(sessions.at(slice(part.start, end))))
+            begin = batch[0][1].start
+            windows = [self._scorers[number].windows(sessions.at(part)) for number, part in batch]
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
@@ -194,11 +189,11 @@ class RuleSearch:
         """The rules with evidence: of many sessions where it decides, and no lookahead is slow."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
         fast = [item for item in candidates if item not in slow]
-        found = list[SimulatedRule]()
+        results = list[SimulatedRule]()
         for logged, part in ((self._many, fast), (self._few, slow)):
             evidence = logged.evaluate([item.rule for item in part]) if part else []
-            found += map(lambda item, of_it: replace(item, evidence=of_it), part, evidence)
-        return found
+            results += map(lambda item, of_it: replace(item, evidence=of_it), part, evidence)
+        return results
 
     def _roll_out(
         self,
@@ -230,11 +225,9 @@ class RuleSearch:
                     live = live[going]
                     actor.keep(going)
         numbers, items = np.concatenate(decisions).T
-        outcomes = dict[DecisionRule, Outcomes]()
-        for number, rule in enumerate(rules):
-            part = slice(number * n, (number + 1) * n)
-            outcomes[rule] = Outcomes(returns[part], lengths[part], items[numbers // n == number])
-        return outcomes
+        shown = [items[numbers // n == number] for number in range(len(rules))]
+        parts = zip(returns.reshape(-1, n), lengths.reshape(-1, n), shown, strict=True)
+        return dict(zip(rules, map(Outcomes._make, parts), strict=True))
 
     def _summarise(self, rule: DecisionRule) -> SimulatedRule:
         sessions = self._sessions[rule]
@@ -257,21 +250,19 @@ class RuleSearch:
         """Whether the log supports what the candidate did, and can evaluate it."""
         if not self.least_users or not self.is_supported(candidate):
             return self.is_supported(candidate)
-        evidence = candidate.evidence
-        if evidence is None or evidence.spread > _WIDEST:
-            return False
-        return candidate.effective_users >= self.least_users
+        is_narrow = candidate.evidence is not None and candidate.evidence.spread <= _WIDEST
+        return is_narrow and candidate.effective_users >= self.least_users
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
+        allowed = [*filter(self.is_allowed, candidates)]
+        return allowed or [*filter(self.is_supported, candidates)]
 
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
         """The best, the start, and allowed ones of the highest value, in more sessions."""
-        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        ranked = (best, *self._find_start(candidates), *sorted(allowed, key=_value, reverse=True))
+        allowed = sorted(filter(self.is_allowed, candidates), key=_value, reverse=True)
+        ranked = (best, *self._find_start(candidates), *allowed)
         rules = dict.fromkeys(candidate.rule for candidate in ranked)
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
@@ -307,8 +298,8 @@ class RuleSearch:
         in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
-        unknown = [candidate for candidate in level if candidate.evidence is None]
-        complete = [candidate for candidate in level if candidate not in unknown]
+        unknown = [candidate for candidate in level if not candidate.evidence]
+        complete = [candidate for candidate in level if candidate.evidence]
 
         def rank(candidate: SimulatedRule) -> tuple[float, ...]:
             evidence, users = candidate.evidence, candidate.effective_users
@@ -344,8 +335,7 @@ class RuleSearch:
         halves = [self._roll_half(rule, number) for number in (0, 1)]
         returns = halves[0].append(halves[1]).returns
         if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
-            more = [self._roll_half(rule, number, part=1) for number in (0, 1)]
-            halves = [half.append(others) for half, others in zip(halves, more, strict=True)]
+            halves = [half.append(self._roll_half(rule, n, 1)) for n, half in enumerate(halves)]
         values = float(halves[0].returns.mean()), float(halves[1].returns.mean())
         value = sum(values) / 2
         first, second = (_standard_error(half.returns) for half in halves)
@@ -416,8 +406,9 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """Simulate candidates part by part of the rule, varying the best rule found so far."""
     problem, config = search.problem, search.problem.config
-    drawn = (DecisionRule(None, temperature=t) for t in sorted(config.temperatures, reverse=True))
-    candidates = search.simulate([rule for of in drawn for rule in _vary_target(of, problem)])
+    hottest_first = sorted(config.temperatures, reverse=True)
+    plain = [DecisionRule(None, temperature=temperature) for temperature in hottest_first]
+    candidates = search.simulate([rule for of in plain for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
     candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
     second = search.best(candidates).rule
@@ -522,11 +513,9 @@ def find_neighbours(
         grid["tag_run"] = [0, *config.tag_runs] if problem.users.fatigue else [0]
     for name, values in grid.items():
         value = getattr(rule, name)
-        smaller = [candidate for candidate in values if candidate < value]
-        larger = [candidate for candidate in values if candidate > value]
-        for neighbour in (*sorted(smaller)[-1:], *sorted(larger)[:1]):
-            changed: dict[str, Any] = {name: neighbour}
-            yield replace(rule, **changed)
+        smaller = sorted(candidate for candidate in values if candidate < value)
+        larger = sorted(candidate for candidate in values if candidate > value)
+        yield from _vary(rule, **{name: [*smaller[-1:], *larger[:1]]})
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:

@@ -126,17 +126,14 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
         (parameter, parameter.grad) for parameter in parameters if parameter.grad is not None
     ]
     dense = [grad for _, grad in gradients if not grad.is_sparse]
-    total = torch.tensor(float(count), device=gradients[0][1].device)
+    total = torch.tensor([float(count)], device=gradients[0][1].device)
     # One message takes less time than one for every gradient.
-    message = torch.cat([total.view(1), *((grad * total).flatten() for grad in dense)])
+    message = torch.cat([total, nn.utils.parameters_to_vector(dense) * total])
     distributed.all_reduce(message)
-    whole = message[0]
-    parts = torch.split(message[1:], [grad.numel() for grad in dense])
-    for grad, part in zip(dense, parts, strict=True):
-        grad.copy_(part.view_as(grad) / whole)
+    nn.utils.vector_to_parameters(message[1:] / message[0], dense)
     for table, grad in gradients:
         if grad.is_sparse:
-            table.grad = _joint_rows(grad.coalesce(), total / whole)
+            table.grad = _joint_rows(grad.coalesce(), total / message[0])
 
 
 def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:

@@ -257,7 +257,7 @@ class _Training:
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
         losses = {}
-        with nullcontext() if self._average is None else self._average.applied():
+        with nullcontext() if self._average is None else self._average.apply():
             if validate is not None:
                 self._module.eval()
                 with torch.no_grad():
@@ -386,7 +386,7 @@ class WeightAverage:
                     whole = torch.full((len(parameter),), self._log, dtype=torch.float64)
                     self._when[name] = whole.to(rows.device)
                 means, rested = self._means[name], self._log - self._when[name][rows]
-                means[rows] = _rested(means[rows], self._weights[name][rows], rested)
+                means[rows] = _age_rows(means[rows], self._weights[name][rows], rested)
         return moved
 
     def after_step(self, moved: Mapping[str, Tensor]) -> None:
@@ -405,7 +405,7 @@ class WeightAverage:
         torch._foreach_lerp_(dense_means, [self._weights[name] for name in dense], 1 - decay)
 
     @contextmanager
-    def applied(self) -> Iterator[None]:
+    def apply(self) -> Iterator[None]:
         """Inside, the module's weights are the averages."""
         own_weights = {name: weights.clone() for name, weights in self._weights.items()}
         tensors, counters = self.state()
@@ -440,13 +440,13 @@ def _averages(
     for name, table in weights.items():
         mean, when = (tensors.get(f"{_AVERAGE}{name}{end}") for end in ("", _WHEN))
         if mean is not None and when is not None:
-            mean = _rested(mean, table, counters["average_log"] - when)
+            mean = _age_rows(mean, table, counters["average_log"] - when)
         if mean is not None:
             means[name] = mean
     return means
 
 
-def _rested(means: Tensor, weights: Tensor, log_shares: Tensor) -> Tensor:
+def _age_rows(means: Tensor, weights: Tensor, log_shares: Tensor) -> Tensor:
     """Averages of rows (M, …) that rested for steps with Σ log d = `log_shares` (M,)."""
     share = log_shares.exp().to(means.dtype)[(..., *[None] * (means.dim() - 1))]
     return torch.where(share < 1, torch.lerp(weights, means, share), means)

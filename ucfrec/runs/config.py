@@ -29,6 +29,7 @@ from ucfrec.settings import (
 )
 
 TABLES: Final = ("policy", "train", "crm", "csg", "augment", "rule")
+_KINDS: Final[tuple[Any, ...]] = (LoopConfig, CRMConfig, CSGConfig, AugmentConfig, RuleConfig)
 
 
 @settings_table("")
@@ -104,6 +105,7 @@ _Setting: TypeAlias = tuple[str, str, Any, str]
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
     policy_type, sources = policy_class(policy_name), {}
+    kinds = policy_type.Config, *_KINDS
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not policy_type.augmented:
         tables["augment"]["copies"] = 0
@@ -111,16 +113,8 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:
-        return Config(
-            policy_name,
-            policy_type.Config(**tables["policy"]),
-            LoopConfig(**tables["train"]),
-            CRMConfig(**tables["crm"]),
-            CSGConfig(**tables["csg"]),
-            AugmentConfig(**tables["augment"]),
-            RuleConfig(**tables["rule"]),
-            require_seed("seed", seed),
-        )
+        parts = {name: kind(**tables[name]) for name, kind in zip(TABLES, kinds, strict=True)}
+        return Config(policy_name, seed=require_seed("seed", seed), **parts)
     except SettingError as error:
         source = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
         raise InputError(f"{source}: {error}" if source else str(error)) from None

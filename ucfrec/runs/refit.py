@@ -42,11 +42,9 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         )
     if trained.record.policy is None:
         raise InputError(f"{first} is not finished; train it to its end first")
-    entries: dict[str, Any] = {
-        "refit_of": _identity(trained),
-        "dropped_observations": trained.record.dropped_observations,
-        "augmentation": trained.record.augmentation,
-    }
+    names = ("dropped_observations", "augmentation", "screening", "update")
+    entries: dict[str, Any] = {name: getattr(trained.record, name) for name in names}
+    entries["refit_of"] = _identity(trained)
     if out == first / REFIT:
         entries |= place_of(store.path, first)
     chosen, has_reward_model = trained.record, trained.reward_model is not None
@@ -65,8 +63,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
         if (first / REWARD_MODEL / SESSIONS).exists():
             shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
-    record = record.copy_with(rule=chosen.rule, reward_model=chosen.reward_model)
-    return record.copy_with(screening=chosen.screening, update=chosen.update).seal(out)
+    return record.copy_with(rule=chosen.rule, reward_model=chosen.reward_model).seal(out)
 
 
 def refit_within(store: EpisodeStore, run: Path) -> RunRecord:

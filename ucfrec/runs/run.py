@@ -49,7 +49,6 @@ from ucfrec.runs.record import (
     RunRecord,
     place_of,
     read_augmentation,
-    read_record,
 )
 from ucfrec.runs.start import (
     begin,
@@ -188,13 +187,10 @@ def train_run(
         with phase("Training the policy", 2, 4):
             if (more := more_augmentation) is not None:
                 augmented = more if augmented is None else augmented.join(more)
-            updated, first = run.record.update, None
-            if refit_of is not None:
-                updated = read_record(refit_of).update
-                first = refit_of / "policy" / "best.safetensors"
+            first = refit_of and refit_of / "policy" / "best.safetensors"
             newest = None
-            if updated is not None:
-                since = run.train.record.n_episodes - updated.episodes
+            if run.record.update is not None:
+                since = run.train.record.n_episodes - run.record.update.episodes
                 newest = np.flatnonzero(run.train.episode_ids >= since)
             policy, train, held_out = run.policy, run.train, None if first else run.validation
             fit = fit_policy(

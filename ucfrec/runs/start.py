@@ -212,11 +212,9 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
     state, names = policy.state_dict(), dict(policy.named_parameters())
     for name in sorted(state.keys() & trained.keys()):
         new, old = state[name], trained[name]
-        learned = name in names or name in _SCALES
-        if learned and new.shape == old.shape:
-            new.copy_(old)
-        elif learned and new.shape[1:] == old.shape[1:] and len(new) > len(old):
-            new[: len(old)] = old
+        fits = new.shape[1:] == old.shape[1:] and new.numel() >= old.numel()
+        if fits and (name in names or name in _SCALES):
+            new.view(-1)[: old.numel()] = old.flatten()
     best, target = initial / CRM / "cvae" / "best.safetensors", out / CRM / INITIAL
     if best.exists() and not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -18,6 +18,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_report import (
     RewardRows,
     calibration_error,
+    draw_episodes,
     draw_steps,
     fit_line,
     score_rows,
@@ -199,15 +200,13 @@ def measure_drift(
         `calibration_error`, `slope`: of the run's reward model on new rows of known items, absent
         without a reward model.
     """
-    episodes = np.random.default_rng(seed).permutation(added.n_episodes)
-    last = int(np.searchsorted(np.cumsum(added.lengths[episodes]), _MOST_STEPS))
-    sample = restrict_to_run(added.select(np.sort(episodes[: last + 1])), old)
+    sample = restrict_to_run(added.select(np.sort(draw_episodes(added, _MOST_STEPS, seed))), old)
     items = sample.column(schema.ITEM)
     assert old.counts is not None
     times_shown = old.counts.shown.numpy()
     times_shown_now = np.bincount(items[items >= 0], None, len(times_shown))
-    drawn = draw_steps(training, _MOST_STEPS, seed)
-    rewards = training.step_values(schema.REWARD, *drawn).astype(np.float64)
+    episodes, steps = draw_steps(training, _MOST_STEPS, seed)
+    rewards = training.step_values(schema.REWARD, episodes, steps).astype(np.float64)
     measures = {
         "unknown_items": counts["new_item_steps"] / max(counts["steps"], 1),
         "unknown_users": counts["new_user_steps"] / max(counts["steps"], 1),

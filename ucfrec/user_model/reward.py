@@ -86,12 +86,12 @@ def _solution(matrix: Tensor, right: Tensor) -> Tensor:
 
 def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Tensor:
     """Likeness (M, L) of items (M,) to each of those shown before them, (M, L), −1 for none."""
-    parts = [history.new_zeros(history.shape, dtype=torch.float32)[:0]]
-    for start in range(0, len(items), _AT_ONCE):
-        earlier = history[start : start + _AT_ONCE]
+    parts = []
+    batches = zip(torch.split(history, _AT_ONCE), torch.split(items, _AT_ONCE), strict=True)
+    for earlier, later in batches:
         profiles = likeness.profile(earlier.reshape(-1, 1), torch.ones(earlier.numel(), 1))
-        own_items = items[start : start + _AT_ONCE].repeat_interleave(history.shape[1])
-        parts.append(likeness.to_items(profiles, own_items.unsqueeze(1)).view(earlier.shape))
+        later_items = later.repeat_interleave(history.shape[1]).unsqueeze(1)
+        parts.append(likeness.to_items(profiles, later_items).view(earlier.shape))
     return torch.cat(parts)
 
 

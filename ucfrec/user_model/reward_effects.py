@@ -334,7 +334,7 @@ class Beginning:
 
     @classmethod
     def of(cls, folder: Path | None, name: str, design: Design) -> "Beginning":
-        """Read what `save_fit` wrote, if there is any, in the sizes of `design`."""
+        """Read what `EffectSearch.save` wrote, if there is any, in the sizes of `design`."""
         effects = Effects()
         if folder is None or not (file := folder / name).exists():
             return cls({}, effects)
@@ -464,8 +464,7 @@ class EffectSearch:
 
         def add_tastes(design: Design, history: Shown) -> Design:
             parts = []
-            for start in range(0, len(design.items), _ROWS):
-                part = slice(start, start + _ROWS)
+            for part in torch.split(torch.arange(len(design.items)), _ROWS):
                 tastes = model.tastes_after(history.at(part))
                 parts.append(tastes[:, 0] + (tastes[:, 1:] * design.rows[part]).sum(1))
             return replace(design, tastes=torch.cat(parts))
@@ -514,15 +513,16 @@ class EffectSearch:
         loss(number)
         return number, *fits[number]
 
+    def save(self, file: Path, model: ItemRewardModel, report: Any) -> None:
+        """Write the model with the effects found, its report, and the effects beside it; `file` is
+        complete last."""
+        model.set_effects(self.effects, self.design.sum_content)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_tensors(place_effects(file), self.effects, {})
+        save_tensors(file, model.state_dict(), dataclasses.asdict(report))
+
     def _losses(self, effects: Effects) -> Tensor:
         return self.held_out.loss(self.held_out.predictor(effects)).double()
-
-
-def save_fit(file: Path, model: ItemRewardModel, effects: Effects, report: Any) -> None:
-    """Write a fitted model with its report, and its effects beside it; `file` is complete last."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    save_tensors(place_effects(file), effects, {})
-    save_tensors(file, model.state_dict(), dataclasses.asdict(report))
 
 
 def place_effects(file: Path) -> Path:

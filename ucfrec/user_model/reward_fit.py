@@ -6,9 +6,10 @@ log has all propensities, rows of new users are weighted, as policies that knew 
 shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypeVar
 
 import numpy as np
 import pydantic
@@ -28,7 +29,6 @@ from ucfrec.user_model.reward_effects import (
     Beginning,
     Design,
     EffectSearch,
-    save_fit,
 )
 from ucfrec.user_model.reward_report import (
     SAVED,
@@ -36,10 +36,12 @@ from ucfrec.user_model.reward_report import (
     ItemRewardReport,
     Line,
     RewardRows,
+    draw_episodes,
     fit_line,
     weigh_by_propensity,
 )
 
+_Report = TypeVar("_Report")
 _USERS_FITTED: Final = "training_users.safetensors"
 """File of the reward model of training users in its folder."""
 _MAX_ROWS: Final = 500_000
@@ -96,9 +98,8 @@ def fit_item_reward_model(
         InputError: a view has no steps, or all training rewards are equal.
     """
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / FITTED
-    if (metadata := _read_fit(file, model)) is not None:
-        with damage_explained(file, REMEDY):
-            return model, ItemRewardReport(**metadata)
+    if file.exists():
+        return model, _read_fit(file, model, ItemRewardReport)
     rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
     set_statistics(model, rows, held_out, train.item_states)
     design = Design.of(model, rows)
@@ -124,7 +125,6 @@ def fit_item_reward_model(
             bar.update()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
-    model.set_effects(search.effects, search.design.sum_content)
     report = ItemRewardReport(
         effects=search.report(),
         new_users=search.new_users,
@@ -132,7 +132,7 @@ def fit_item_reward_model(
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),
     )
-    save_fit(file, model, search.effects, report)
+    search.save(file, model, report)
     return model, report
 
 
@@ -159,8 +159,7 @@ def refit_item_reward_model(
             search.set_tastes(tensors["tastes.root"])
     search.kept = begin.spreads
     search.fit_to(search.design)
-    model.set_effects(search.effects, search.design.sum_content)
-    save_fit(folder / FITTED, model, search.effects, report)
+    search.save(folder / FITTED, model, report)
     return model
 
 
@@ -170,9 +169,8 @@ def fit_training_users(
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
-    if (metadata := _read_fit(file, model)) is not None:
-        with damage_explained(file, REMEDY):
-            return model, TrainingUsersReport(**metadata)
+    if file.exists():
+        return model, _read_fit(file, model, TrainingUsersReport)
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
@@ -194,16 +192,13 @@ def fit_training_users(
     line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
     search.fit_to(design)
     report = TrainingUsersReport(line, search.report(), weights is not None)
-    model.set_effects(search.effects, search.design.sum_content)
-    save_fit(file, model, search.effects, report)
+    search.save(file, model, report)
     return model, report
 
 
 def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:
     """The training sessions, in an order drawn by `seed`; of many, the first 100,000 steps."""
-    order = np.random.default_rng([seed, 5]).permutation(train.n_episodes)
-    last = int(np.searchsorted(np.cumsum(train.lengths[order]), _MAX_STEPS))
-    return train.select(order[: last + 1])
+    return train.select(draw_episodes(train, _MAX_STEPS, [seed, 5]))
 
 
 def set_statistics(
@@ -239,13 +234,12 @@ def set_statistics(
     model.likeness.start_from(states)
 
 
-def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
-    if not file.exists():
-        return None
+def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]) -> _Report:
     tensors, metadata = load_tensors(file)
     load_weights(file, model, tensors)
     model.eval()
-    return metadata
+    with damage_explained(file, REMEDY):
+        return report(**metadata)
 
 
 def _select_some(design: Design, seed: int) -> Design:

@@ -14,6 +14,7 @@ from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
+from ucfrec.results.statistics import ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
 _BINS: Final = 10
@@ -76,6 +77,13 @@ class RewardRows:
 def draw_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
     """Episodes and steps (M,) of all steps of a view; of more than `limit`, so many drawn."""
     return view.locate(draw_numbers(view.n_steps, limit, seed))
+
+
+def draw_episodes(view: EpisodeStore, most: int, seed: int | list[int]) -> IntArray:
+    """Positions of episodes of a view in a drawn order; of many, the first with `most` steps."""
+    order = np.random.default_rng(seed).permutation(view.n_episodes)
+    last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
+    return order[: last + 1]
 
 
 def draw_numbers(count: int, limit: int, seed: int) -> IntArray:
@@ -161,11 +169,10 @@ class ItemRewardReport:
 
 def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     """Linear predictors (M,) of the items shown in `rows`."""
-    scores = [torch.zeros(0)]
-    for start in range(0, len(rows), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        states, users, history = rows.states[part], rows.users[part], rows.history.at(part)
-        scores.append(model.score(states, history, users, rows.items[part]))
+    scores = [
+        model.score(rows.states[part], rows.history.at(part), rows.users[part], rows.items[part])
+        for part in torch.split(torch.arange(len(rows)), _CHUNK)
+    ]
     return torch.cat(scores)
 
 
@@ -227,7 +234,8 @@ class UserCalibration:
         slope, intercept = torch.tensor(lines[::-1])[torch.from_numpy(half)].unbind(1)
         expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
         observed = (counts * rows.rewards).double().numpy()
-        off = expected.sum() / observed.sum() - 1 if observed.sum() > 0 else 0.0
-        by_user = np.bincount(episodes, expected - (1 + off) * observed)
-        error = float(np.sqrt(np.square(by_user).sum()) / abs(observed.sum() or 1.0))
-        return cls(line, (lines[0], lines[1]), float(off), error, weights is not None)
+        ratio, error = 1.0, 0.0
+        if observed.sum() > 0:
+            sums = [np.bincount(episodes, x).astype(np.float64) for x in (expected, observed)]
+            ratio, error = ratio_with_error(sums[0], sums[1])
+        return cls(line, (lines[0], lines[1]), ratio - 1, error, weights is not None)

@@ -1,6 +1,5 @@
 """When users leave: the probability that a session ends with a step, fitted to logged steps."""
 
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -139,11 +138,10 @@ class SessionEnd:
         parts = {}
         if "thresholds" in tensors:
             parts["inputs"] = inputs = tensors["inputs"]
-            if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
-                raise ValueError("inputs are not numbers of inputs")
-            if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
-                raise ValueError("inputs are beyond the last input")
             trees, splits = inputs.shape
+            is_beyond = bool(((inputs < 0) | (inputs >= _INPUTS)).any())
+            if is_beyond or splits > _SPLITS or inputs.dtype != torch.int64:
+                raise ValueError("inputs are beyond the last input")
             shapes = {"thresholds": (trees, splits), "leaves": (trees, 2**splits), "base": ()}
         for name, shape in shapes.items():
             parts[name] = tensors[name]
@@ -210,15 +208,10 @@ class SessionEnd:
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
         alike = self._likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
         repeated, number = history.items.unsqueeze(2) == items.unsqueeze(1), steps.unsqueeze(1)
-        if self._trees is None:
-            each = (_columns(alike, repeated, entry, number) for entry in rewards)
-            inputs = torch.cat([torch.stack(columns, -1) for columns in each])
-            odds = self._log_odds(inputs.flatten(0, 1))
-            return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
-        columns = torch.stack(_columns(alike, repeated, rewards[0], number)).flatten(1)
-        values = [entry.flatten() for entry in rewards]
-        odds_of_each = self._trees.replace_input(columns.T, _REWARD, values)
-        return [torch.sigmoid(odds).view(batch, count) for odds in odds_of_each]
+        columns = (_columns(alike, repeated, entry, number) for entry in rewards)
+        inputs = torch.cat([torch.stack(entries).flatten(1) for entries in columns], 1)
+        odds = self._log_odds(inputs.T)
+        return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         if self._trees is not None:
@@ -245,8 +238,7 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     zeros, highest = inputs.new_zeros(size), inputs.new_full((size,), torch.inf)
     if not weights:
         bias = torch.logit(torch.tensor(float(ended.mean()) if len(ended) else 0.0).double())
-        parts = {"mean": zeros, "scale": zeros + 1, "weights": zeros.clone(), "bias": bias}
-        return {"highest": highest, **parts}
+        return dict(zip(_LOGISTIC, (highest, zeros, zeros + 1, zeros, bias), strict=True))
     # The last steps of the longest sessions are too few to tell more than those before.
     highest[_STEPS] = inputs[:, _STEPS].topk(_FEWEST, 0).values[-1]
     inputs = inputs.minimum(highest)
@@ -255,7 +247,7 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
     model.fit(((inputs - mean) / scale).numpy(), ended)
     slopes, bias = torch.from_numpy(model.coef_[0]), torch.tensor(model.intercept_[0])
-    return {"highest": highest, "mean": mean, "scale": scale, "weights": slopes, "bias": bias}
+    return dict(zip(_LOGISTIC, (highest, mean, scale, slopes, bias), strict=True))
 
 
 def describe_steps(
@@ -296,30 +288,14 @@ class BoostedTrees:
         self._bits = bits.scatter_add_(1, which.view(inputs.shape), powers)
         """(T, U) float32 bits of the columns' numbers that each of the U different splits sets."""
         self._numbers, self._thresholds = splits[:, 0].long(), splits[:, 1:]
-        """Input (U,), ascending, and threshold (U, 1) of these splits."""
-        self._sorted: list[int] = self._numbers.tolist()
+        """Input (U,) and threshold (U, 1) of these splits."""
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        return self._sums(self._bits @ self._compare(inputs))
-
-    def replace_input(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Log-odds (M,) as from `inputs` (M, F), fastest as a transpose, with one of them replaced
-        by each of some values (M,)."""
-        first, end = (bisect_left(self._sorted, value) for value in (number, number + 1))
-        at_most = self._compare(inputs)
-        at_most[first:end] = 0.0
-        columns, bits = self._bits @ at_most, self._bits[:, first:end]
-        thresholds = self._thresholds[first:end]
-        below = ((entry.double() <= thresholds).float() for entry in values)
-        return [self._sums(columns + bits @ at_most) for at_most in below]
-
-    def _compare(self, inputs: Tensor) -> Tensor:
-        """(U, M) float32, 1 where the input of a split is at most its threshold."""
-        return torch.le(inputs.double().T[self._numbers], self._thresholds).float()
-
-    def _sums(self, columns: Tensor) -> Tensor:
-        """The trees' sum (M,) from numbers of leaves (T, M), which float32 has exactly."""
-        return self._base + self._leaves.gather(1, columns.long()).sum(0)
+        """Log-odds (M,) from inputs (M, F)."""
+        at_most = torch.le(inputs.double().T[self._numbers], self._thresholds).float()
+        # Numbers of leaves, which float32 has exactly.
+        columns = (self._bits @ at_most).long()
+        return self._base + self._leaves.gather(1, columns).sum(0)
 
 
 def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:

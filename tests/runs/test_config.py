@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ucfrec.commands.train import settings_text
 from ucfrec.errors import InputError
 from ucfrec.policies.registry import BUILT_IN, policy_class
 from ucfrec.runs.config import TABLES, config_from_dict, resolve_config
-from ucfrec.settings import describe
+from ucfrec.settings import allowed_values
 
 SOURCE = Path(__file__).parents[2] / "ucfrec"
 
@@ -143,10 +144,12 @@ def test_every_field_means_something_and_is_read(policy: str, read: set[str]) ->
     config = resolve_config(policy)
     tables = [(name, getattr(config, name)) for name in TABLES]
     for name, table in tables:
-        listed = list(describe(name, table))
-        assert [s.key for s in listed] == [f"{name}.{key}" for key in asdict(table)]
-        for setting in listed:
-            assert setting.meaning.endswith("."), setting.key
-            assert setting.key.partition(".")[2] in read, setting.key
-            bounded = re.search(r"\d|'|true", setting.allowed)
-            assert bounded, f"{setting.key} takes any value: {setting.allowed}"
+        for field in asdict(table):
+            assert field in read, f"{name}.{field}"
+            allowed = allowed_values(table, field)
+            bounded = re.search(r"\d|'|true", allowed)
+            assert bounded, f"{name}.{field} takes any value: {allowed}"
+    text = settings_text(policy, 100)
+    for setting in (f"{name}.{field}" for name, table in tables for field in asdict(table)):
+        meaning = text.partition(f"  {setting} ")[2].split("\n")[1]
+        assert meaning.startswith("      "), setting

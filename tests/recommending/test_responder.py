@@ -249,7 +249,7 @@ def test_a_larger_share_keeps_the_users_that_it_had(user: int, share: float) -> 
 
 @pytest.mark.parametrize("given", ["a", "a=x", "a=0.5", "a=0.5,b=0.6", "a=1.5,b=-0.5"])
 def test_shares_that_are_none_are_refused(given: str) -> None:
-    with pytest.raises(InputError, match="--split"):
+    with pytest.raises(InputError, match="shares"):
         parse_split(given)
     assert parse_split("a=0.9, b=0.1") == {"a": 0.9, "b": 0.1}
 

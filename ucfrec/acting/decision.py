@@ -20,6 +20,8 @@ _Return = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Items = Annotated[int, Field(ge=1, le=10**9)]
 _COLDEST: Final = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
+_LAST: Final = -1e40
+"""Log-probability below those of float32: of items that are drawn once no others are left."""
 _FEW: Final = 2**16
 """Scores up to which looking for blocks first costs more."""
 _BLOCK: Final = 128
@@ -84,11 +86,9 @@ class DecisionRule:
         Raises:
             InputError: a field is unknown, missing, of another type or out of range.
         """
-        if not isinstance(values, Mapping):
-            raise InputError(f"{source} is not a decision rule")
         try:
             return cls(**values)
-        except InputError as error:
+        except (InputError, TypeError) as error:
             raise InputError(f"{source} is not a decision rule: {error}") from None
 
     def __str__(self) -> str:
@@ -177,26 +177,21 @@ class DecisionRule:
         if not self.draws:
             return best_items(scores, k), torch.ones(len(scores), k, dtype=torch.float64)
         assert uniforms is not None
-        modes = [(share, logs.double()) for share, logs in self._modes(scores)]
-        logs = modes[0][1]
+        modes = self._modes(scores)
+        if len(modes) > 1 or int((modes[0][1] > -torch.inf).sum(1).min()) < k:
+            ranks = scores.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
+            last = _LAST * (1.0 + ranks.double())
+            modes = [(share, logs.double().maximum(last)) for share, logs in modes]
+        logs = modes[0][1].double()
         if len(modes) > 1:
             logs = torch.where(uniforms[:, -1:] < self.explore, modes[1][1], logs)
         # The largest sums of log-probability and Gumbel noise are draws without replacement.
         noise = uniforms[:, :-1].double().clamp(min=1e-300)
-        perturbed = logs - torch.log(-torch.log(noise))
-        highest = perturbed.topk(k, dim=-1)
-        items = highest.indices
-        few_left = bool(torch.isneginf(highest.values).any())
-        if few_left or len(modes) > 1:
-            by_score = scores.argsort(dim=-1, descending=True, stable=True)
-        if few_left:
-            places = perturbed.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
-            items = by_score.gather(1, places)[:, :k]
+        items = (logs - torch.log(-torch.log(noise))).topk(k, dim=-1).indices
         if len(modes) == 1:
             return items, _conditional(logs, items).exp()
-        follows = _next_best(by_score, items)
         exploiting, exploring = (
-            math.log(share) + _conditional(logs, items, follows).cumsum(1) for share, logs in modes
+            math.log(share) + _conditional(logs, items).cumsum(1) for share, logs in modes
         )
         start = torch.zeros(len(items), 1, dtype=torch.float64)
         joint = torch.logaddexp(exploiting, exploring)
@@ -241,37 +236,18 @@ def _only_best(scores: Tensor, count: int | None) -> Tensor:
     return torch.full_like(scores, -torch.inf).scatter(1, best, scores.gather(1, best))
 
 
-def _conditional(logs: Tensor, items: Tensor, follows: Tensor | None = None) -> Tensor:
+def _conditional(logs: Tensor, items: Tensor) -> Tensor:
     """Log-probabilities (B, k) of items drawn without replacement, each given those before it.
 
     Args:
         logs: (B, n) float64 log-probabilities of a single draw.
         items: (B, k) in the order drawn.
-        follows: (B, k) whether the item is next once none is left to draw; None for always.
     """
     of_items = logs.gather(1, items)
     remainder = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
     # What is left before each draw is summed from the end, so that nothing cancels.
     left = torch.cat([remainder, of_items.flip(1)], dim=1).logcumsumexp(1).flip(1)[:, :-1]
-    conditional = (of_items - left).clamp(max=0.0)
-    exhausted = torch.zeros_like(conditional)
-    if follows is not None:
-        exhausted = exhausted.masked_fill(~follows, -torch.inf)
-    return torch.where(torch.isneginf(left), exhausted, conditional)
-
-
-def _next_best(by_score: Tensor, items: Tensor) -> Tensor:
-    """(B, k) whether each of the items is the best of those that are not before it.
-
-    Args:
-        by_score: (B, n) all items, best first.
-        items: (B, k).
-    """
-    ranks = by_score.argsort(dim=-1).gather(1, items)
-    return torch.stack(
-        [(ranks[:, :n] < ranks[:, n : n + 1]).sum(1) == ranks[:, n] for n in range(items.shape[1])],
-        dim=1,
-    )
+    return (of_items - left).clamp(max=0.0)
 
 
 def best_items(scores: Tensor, k: int) -> Tensor:

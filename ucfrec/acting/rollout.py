@@ -1,8 +1,7 @@
 """Roll out episodes with one actor in many environments in parallel; uniformly random actors."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
@@ -97,8 +96,7 @@ class Uniform(Memoryless):
         return chosen, (1.0 / n_allowed).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One step of M episodes; row i of every array belongs to the same episode."""
 
     rows: IntArray
@@ -123,8 +121,7 @@ class Step:
     """(M,) users of the step; None if the environment does not report them (`USER_IDS`)."""
 
 
-@dataclass(frozen=True)
-class Episodes:
+class Episodes(NamedTuple):
     """Outcome of every episode."""
 
     returns: Float64Array
@@ -185,11 +182,11 @@ def rollout(
             returns[episode[rows]] += rewards[rows]
             lengths[episode[rows]] += 1
             if on_step is not None:
-                after, users = _undo_reset(next_observations, next_info), info.get(USER_IDS)
-                columns = [episode, observations, actions, rewards, after]
-                columns += [propensities, terminated, truncated, users]
-                of_rows: Any = (None if column is None else column[rows] for column in columns)
-                on_step(Step(rows, *of_rows))
+                final = _undo_reset(next_observations, next_info)
+                columns = [episode, observations, actions, rewards, final]
+                columns += [propensities, terminated, truncated, info.get(USER_IDS)]
+                of_rows = [None if column is None else column[rows] for column in columns]
+                on_step(Step._make([rows, *of_rows]))
             ended = terminated | truncated
             actor.begin(np.flatnonzero(ended))
             bar.update(int((ended & live).sum()))
@@ -204,5 +201,5 @@ def _undo_reset(next_observations: Float32Array, info: Mapping[str, Any]) -> Flo
     if "final_obs" not in info:
         return next_observations
     final_observations, ended = next_observations.copy(), np.asarray(info["_final_obs"])
-    final_observations[ended] = np.stack(list(info["final_obs"][ended]))
+    final_observations[ended] = np.stack(info["final_obs"][ended])
     return final_observations

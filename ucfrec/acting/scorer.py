@@ -5,7 +5,7 @@ scores. All operations can be exported to ONNX.
 """
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -104,9 +104,7 @@ class Scorer:
         self.policy, self.rule, self.states = policy, rule, states
         self.returns, self.reward_model = returns or ReturnToGo(), reward_model
         self.session_end = session_end
-        self._outcomes: tuple[float, float] | None = None
-        if reward_model is not None and bool(reward_model.binary):
-            self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
+        self._has_two_rewards = reward_model is not None and bool(reward_model.binary)
         self._items = _ItemProduct(policy, reward_model, states)
         self.engine: Callable[[Sessions, Tensor], Tensor] | None = None
         """Computes the scores (1, n_items) of a single session, given what may not be shown, bool
@@ -186,9 +184,7 @@ class Scorer:
         """(n_items, d + 1) vectors of all items, the last column a bias; their products with the
         factors of `weigh` and 1 are most of the scores."""
         matrix, bias = self._items.rows(policy=True, rewards=bool(self.rule.reward_weight))
-        vectors = np.empty((len(bias), len(matrix) + 1), dtype=np.float32)
-        vectors[:, :-1], vectors[:, -1] = matrix.numpy().T, bias.numpy()
-        return vectors
+        return torch.cat([matrix.T, bias.unsqueeze(1)], dim=1).numpy()
 
     @torch.no_grad()
     def windows(self, sessions: Sessions) -> Windows:
@@ -236,9 +232,7 @@ class Scorer:
 
     def weigh(self, query: Query) -> Part:
         """The parts of a query, weighted as the rule says."""
-        weight = self.rule.reward_weight
-        model = query.model if weight else None
-        return self._items.weigh(query.items, query.policy, model, weight)
+        return self._items.weigh(query, True, self.rule.reward_weight)
 
     def scores(
         self,
@@ -283,12 +277,18 @@ class Scorer:
         empty: bool = False,
     ) -> Tensor:
         """`scores` of the sessions of a query."""
+        rule, items = self.rule, self._items
         if self._is_plain:
-            weight = self.rule.reward_weight
-            model = query.model if weight else None
-            scores = self._items.scores(query.items, query.policy, model, weight, query.outputs)
+            scores = items.scores(query, True, rule.reward_weight)
         else:
-            scores = self._compose(query)
+            if rule.policy_weight:
+                scores = rule.policy_weight * items.scores(query, True, 0.0)
+            else:
+                scores = torch.zeros(query.items.shape[0], items.count)
+            if rule.looks_ahead:
+                scores = self._add_lookahead(scores, items.scores(query, False, 1.0), query)
+            elif rule.reward_weight:
+                scores = scores + rule.reward_weight * items.scores(query, False, 1.0)
         exporting = torch.compiler.is_exporting()
         if not exporting:
             _require_scores(scores, empty=True)
@@ -296,7 +296,7 @@ class Scorer:
             scores[left_out] = -torch.inf
         if excluded is not None:
             scores = scores.masked_fill_(excluded, -torch.inf)
-        for without in self._items.without_tags(self.rule, query.sessions.shown):
+        for without in items.without_tags(rule, query.sessions.shown):
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
             some = left.amax(1, keepdim=True) > -torch.inf
@@ -308,7 +308,10 @@ class Scorer:
         """f̂_r (B, n_items), in the reward model's units, up to a constant per row."""
         states = sessions.windows(self.states, 1).states[:, -1]
         part = self._items.model_part(sessions, states)
-        return self._items.scores(self._items.pad_items(sessions.shown), None, part, 1.0)
+        items = self._items.pad_items(sessions.shown)
+        return self._items.scores(
+            Query(sessions, states, items, None, None, None, part), False, 1.0
+        )
 
     @torch.inference_mode()
     def scores_of_some(
@@ -328,19 +331,6 @@ class Scorer:
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
-    def _compose(self, query: Query) -> Tensor:
-        """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
-        rule, items, scores = self.rule, query.items, torch.zeros(())
-        if rule.policy_weight:
-            of_policy = self._items.scores(items, query.policy, None, 0.0, query.outputs)
-            scores = rule.policy_weight * of_policy
-        if query.model is not None and rule.reward_weight:
-            odds = self._items.scores(items, None, query.model, 1.0)
-            if rule.looks_ahead:
-                return self._add_lookahead(scores, odds, query)
-            scores = scores + rule.reward_weight * odds
-        return scores.expand(items.shape[0], self._items.count).clone()
-
     def _add_lookahead(self, scores: Tensor, odds: Tensor, query: Query) -> Tensor:
         """Scores of the policy plus expected reward and lookahead, (B, n_items).
 
@@ -359,8 +349,8 @@ class Scorer:
         scores = scores + weight * rewards
         best = best_items(scores, min(_LOOKED_AT, self._items.count))
         some, recent = rewards.gather(1, best), recent.latest(model.lags)
-        if end.uses_rewards and self._outcomes is not None:
-            outcomes = [torch.full_like(some, reward) for reward in self._outcomes]
+        if end.uses_rewards and self._has_two_rewards:
+            outcomes = [v.expand_as(some) for v in (model.reward_low, model.reward_high)]
             low, high = end.score_items(recent, best, outcomes, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
@@ -385,19 +375,19 @@ class _ItemProduct:
         self._head = head if isinstance(head, ItemHead) else None
         exposure = None if self._head is None else self._head.exposure
         self.lags = 0 if exposure is None else exposure.lags
+        pairs: Iterable[tuple[Tensor, Tensor]] = ()
+        if exposure is not None and model is not None:
+            pairs = zip(exposure.likeness.buffers(), model.likeness.buffers(), strict=True)
         self.own = (
             self._head is None
             or kind.act is not SequencePolicy.act
             or kind.act_and_features is not SequencePolicy.act_and_features
-            or (
-                not (exposure is None or model is None)
-                and not _are_equal(exposure.likeness, model.likeness)
-            )
+            or not all(torch.equal(ours.cpu(), theirs.cpu()) for ours, theirs in pairs)
         )
         """Whether the policy scores items in a way of its own."""
         self._exposure = None if self.own else exposure
-        likeness = [term.likeness for term in (self._exposure, model) if term is not None]
-        self._likeness = likeness[0] if likeness else None
+        terms = (term for term in (self._exposure, model) if term is not None)
+        self._likeness = next((term.likeness for term in terms), None)
         self._by_direction = self._likeness is not None and not self._likeness.tags.shape[1]
         self._columns = max(self.lags, 0 if model is None else model.lags)
 
@@ -477,9 +467,7 @@ class _ItemProduct:
                 _pad(weights, self._columns, 0) for weights in self._exposure.weights(exposed)
             )
         part = Part(features / features.shape[-1] ** 0.5, repeated, alike)
-        if device.type == "cpu":
-            return features, part
-        return features.cpu(), Part(part.factors.cpu(), part.repeated.cpu(), part.alike.cpu())
+        return features.cpu(), Part._make(values.cpu() for values in part)
 
     def model_part(self, sessions: Sessions, states: Tensor) -> Part:
         """The reward model's part, in states (B, S) before the steps to decide."""
@@ -494,46 +482,33 @@ class _ItemProduct:
         """Whether what was shown counts."""
         return self._likeness is not None and (rewards or (policy and self._exposure is not None))
 
-    def weigh(
-        self, items: Tensor, policy: Part | None, model: Part | None, reward_weight: float
-    ) -> Part:
+    def weigh(self, query: Query, policy: bool, reward_weight: float) -> Part:
         """The weighted sum of the parts; without a part, the rows of its own are excluded."""
+        items, model = query.items, query.model if reward_weight else None
         repeated = alike = torch.zeros_like(items, dtype=torch.float32)
         factors = list[Tensor]()
-        if policy is not None:
-            factors.append(policy.factors)
-            repeated, alike = policy.repeated, policy.alike
+        if policy and query.policy is not None:
+            of_policy, repeated, alike = query.policy
+            factors.append(of_policy)
         if model is not None:
             repeated = repeated + reward_weight * model.repeated
             alike = alike + reward_weight * model.alike
-        if self._by_direction and self._counts_shown(policy is not None, model is not None):
+        if self._by_direction and self._counts_shown(policy, bool(reward_weight)):
             assert self._alike is not None
             factors.append(self._alike.profile(items, alike))
         if model is not None:
             factors.append(reward_weight * model.factors)
         return Part(torch.cat(factors, 1) if factors else repeated[:, :0], repeated, alike)
 
-    def scores(
-        self,
-        items: Tensor,
-        policy: Part | None,
-        model: Part | None,
-        reward_weight: float,
-        outputs: Tensor | None = None,
-    ) -> Tensor:
-        """(B, n_items) of the parts, up to a constant per row.
-
-        Args:
-            items: (B, N) of `pad_items`.
-            outputs: (B, n_items) of a policy that scores items in a way of its own.
-        """
-        if policy is None and model is None:
-            assert outputs is not None
+    def scores(self, query: Query, policy: bool, reward_weight: float) -> Tensor:
+        """(B, n_items) of the policy and the weighted reward model, up to a constant per row."""
+        items, outputs = query.items, query.outputs if policy else None
+        if outputs is not None and not reward_weight:
             return outputs.clone()  # it may be what the policy keeps
-        part = self.weigh(items, policy, model, reward_weight)
-        matrix, bias = self.rows(policy is not None, model is not None)
+        part = self.weigh(query, policy, reward_weight)
+        matrix, bias = self.rows(policy, bool(reward_weight))
         scores = torch.addmm(bias if outputs is None else outputs, part.factors, matrix)
-        if not self._counts_shown(policy is not None, model is not None):
+        if not self._counts_shown(policy, bool(reward_weight)):
             return scores
         if self._alike is not None and not self._by_direction:
             shared, sets = self._alike.to_sets(self._alike.profile(items, part.alike))
@@ -575,11 +550,6 @@ class _ItemProduct:
         last = of_likeness if self._counts_shown(policy, rewards) else of_policy
         rows = matrix[0 if policy else of_policy : len(matrix) if rewards else last]
         return rows, bias if policy else torch.zeros(())
-
-
-def _are_equal(first: Likeness, second: Likeness) -> bool:
-    pairs = (first.tags, second.tags), (first.directions, second.directions)
-    return all(torch.equal(left.cpu(), right.cpu()) for left, right in pairs)
 
 
 def _pad(values: Tensor, length: int, padding: int) -> Tensor:

@@ -47,9 +47,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     with lock_path(path):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already; remove it or name another output folder")
-        with _scratch_moved(path) as scratch:
+        with _scratch(path) as scratch:
             scratch.mkdir()
             yield scratch
+            scratch.replace(path)
 
 
 @contextmanager
@@ -61,35 +62,30 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
-    with claim(path, wait=True), _scratch_moved(path) as scratch:
-        yield scratch
-
-
-@contextmanager
-def _scratch_moved(path: Path) -> Iterator[Path]:
-    """The scratch of a claimed path, which becomes the path at the end."""
-    remove_leftovers(path.parent)
-    scratch = scratch_of(path)
-    _remove(scratch)
-    try:
+    with claim(path, wait=True), _scratch(path) as scratch:
         yield scratch
         scratch.replace(path)
-    finally:
-        _remove(scratch)
 
 
 @contextmanager
 def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
     """Yield a new folder in `parent` that no other user can read; removed at the end."""
     path = parent / f"{name}-{secrets.token_hex(8)}"
-    with lock_path(path):
-        remove_leftovers(parent)
-        scratch = scratch_of(path)
+    with lock_path(path), _scratch(path) as scratch:
         scratch.mkdir(mode=0o700)
-        try:
-            yield scratch
-        finally:
-            _remove(scratch)
+        yield scratch
+
+
+@contextmanager
+def _scratch(path: Path) -> Iterator[Path]:
+    """The scratch of a claimed path, removed at the end."""
+    remove_leftovers(path.parent)
+    scratch = scratch_of(path)
+    _remove(scratch)
+    try:
+        yield scratch
+    finally:
+        _remove(scratch)
 
 
 def scratch_of(path: Path) -> Path:
@@ -172,11 +168,9 @@ def remove_leftovers(folder: Path, within: bool = False) -> None:
 
 def _remove(path: Path) -> None:
     """Remove a file, or a folder with all it holds, if it exists and can be removed."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+    shutil.rmtree(path, ignore_errors=True)  # a file or link is left
+    with suppress(OSError):
+        path.unlink()
 
 
 def _lock_of(path: Path) -> Path:

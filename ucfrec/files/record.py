@@ -159,8 +159,7 @@ class Record(Entry):
             if name not in self.files:
                 continue
             if fault := self._find_fault(folder, name, bool(names) or self.files[name][0] <= small):
-                where = folder / name
-                raise InputError(f"{where} {fault}; restore the file, or {self.REMEDY}")
+                raise InputError(f"{folder / name} {fault}; restore the file, or {self.REMEDY}")
 
     def faults(self, folder: Path) -> Iterator[tuple[str, str]]:
         """Read every file; yields (path in the folder, what is wrong with it)."""

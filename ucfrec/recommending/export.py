@@ -1,15 +1,14 @@
 """A trained policy under its rule as an ONNX graph, for other runtimes and for single requests."""
 
-import contextlib
 import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -66,8 +65,7 @@ _SERVE: Final = "use `ucfrec serve` or `recommend --stream`"
 _TORCH: Final = "use --engine torch"
 
 
-@dataclass(frozen=True)
-class Exported:
+class Exported(NamedTuple):
     """What was written."""
 
     size: int
@@ -172,81 +170,65 @@ def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return torch.where(left, items, -1), torch.where(left, values - total, -torch.inf)
 
 
-class ScoreGraph:
-    """`Scorer.scores` of one session, by onnxruntime and one thread.
+def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Tensor]:
+    """`Scorer.scores` of one session, given what (1, n_items) bool may not be shown, by onnxruntime
+    and one thread.
 
     Raises:
         InputError: the extra `export` is not installed, the policy scores items in a way of its own
             or cannot be exported, or what the graph gives differs from torch's.
     """
+    _require_installed()
+    network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
+    example = _draw_inputs(scorer, 1, seed=0, mask=True)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / GRAPH
+        _write_graph(network, example, path, ["scores"], kind, _TORCH)
+        runner = _start_runner(path)
+    for number in range(1, 1 + _COMPARED):
+        example = _draw_inputs(scorer, 1, seed=number, mask=True)
+        _measure_difference(network, runner, example, _TORCH)
 
-    def __init__(self, scorer: Scorer, kind: str) -> None:
-        _require_installed()
-        network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
-        example = _draw_inputs(scorer, 1, seed=0, mask=True)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / GRAPH
-            _write_graph(network, example, path, ["scores"], kind, _TORCH)
-            self._runner = _start_runner(path, threads=1)
-        for number in range(1, 1 + _COMPARED):
-            example = _draw_inputs(scorer, 1, seed=number, mask=True)
-            _measure_difference(network, self._runner, example, _TORCH)
+    def score(session: Sessions, excluded: Tensor) -> Tensor:
+        fields = zip(_STATE, vars(session).values(), strict=False)
+        inputs = {name: value for name, value in fields if value is not None}
+        return torch.from_numpy(_run_graph(runner, inputs | {_EXCLUDED: excluded})[0])
 
-    def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
-        """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be
-        shown."""
-        inputs = {**_name_inputs(session), _EXCLUDED: excluded}
-        return torch.from_numpy(_run_graph(self._runner, inputs)[0])
-
-
-def _draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
-    """Random sessions of at most twice as many steps as the scorer reads."""
-    states, length = scorer.states, scorer.length
-    assert states is not None
-    rng = np.random.default_rng(seed)
-    steps = rng.integers(0, 2 * length + 1, size=sessions)
-    inside = np.arange(length) >= length - steps[:, None]
-    items = np.where(inside, rng.integers(len(states.embeddings), size=inside.shape), -1)
-    rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
-    rewards = np.where(inside, rewards, 0.0).astype(np.float32)
-    users = rng.integers(-1, max(1, len(states.user_features)), size=sessions)
-    observed, observations = scorer.policy.state_mean.shape[0] - states.size, None
-    if observed:
-        size = (sessions, scorer.policy.config.context, observed)
-        observations = torch.from_numpy(rng.normal(size=size).astype(np.float32))
-    return Sessions(
-        actions=torch.from_numpy(items),
-        rewards=torch.from_numpy(rewards),
-        steps=torch.from_numpy(steps),
-        collected=torch.from_numpy(rewards.sum(1, dtype=np.float64)),
-        users=torch.from_numpy(users),
-        observations=observations,
-    )
+    return score
 
 
 def _draw_inputs(scorer: Scorer, sessions: int, seed: int, mask: bool = False) -> dict[str, Tensor]:
-    """Random inputs of a graph; the items excluded are numbers, or a `mask` of all items."""
-    assert scorer.states is not None
-    n, rng = len(scorer.states.embeddings), np.random.default_rng(seed)
-    excluded: Array = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    """Random inputs of a graph, of sessions of at most twice as many steps as the scorer reads; the
+    items excluded are numbers, or a `mask` of all items."""
+    states, length, rng = scorer.states, scorer.length, np.random.default_rng(seed)
+    assert states is not None
+    n, steps = len(states.embeddings), rng.integers(0, 2 * length + 1, size=sessions)
+    inside = np.arange(length) >= length - steps[:, None]
+    rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
+    rewards = np.where(inside, rewards, 0.0).astype(np.float32)
+    arrays: dict[str, Array] = {
+        "items": np.where(inside, rng.integers(n, size=inside.shape), -1),
+        "rewards": rewards,
+        "steps": steps,
+        "collected": rewards.sum(1, dtype=np.float64),
+        "users": rng.integers(-1, max(1, len(states.user_features)), size=sessions),
+    }
+    if observed := scorer.policy.state_mean.shape[0] - states.size:
+        size = (sessions, scorer.policy.config.context, observed)
+        arrays["observations"] = rng.normal(size=size).astype(np.float32)
     if mask:
-        excluded = rng.random((sessions, n)) < rng.uniform(0, _MOST_EXCLUDED)
-    inputs = _name_inputs(_draw_sessions(scorer, sessions, seed))
-    return inputs | {_EXCLUDED: torch.from_numpy(excluded)}
+        arrays[_EXCLUDED] = rng.random((sessions, n)) < rng.uniform(0, _MOST_EXCLUDED)
+    else:
+        arrays[_EXCLUDED] = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
-def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
-    """The fields of sessions that are there, as inputs of a graph, by name."""
-    values = (getattr(sessions, field) for field in ("actions", *_STATE[1:]))
-    return {name: v for name, v in zip(_STATE, values, strict=True) if v is not None}
-
-
-def _start_runner(path: Path, threads: int = 0) -> Any:
-    """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
+def _start_runner(path: Path) -> Any:
+    """An `onnxruntime.InferenceSession` with one thread."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = threads
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
@@ -285,10 +267,10 @@ def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: floa
     largest = 0.0
     for theirs, tensor in pairs:
         ours = tensor.numpy()
-        same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
-        finite = np.isfinite(ours) & np.isfinite(theirs)
-        apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(size, np.abs(ours[finite]))
-        largest = max(largest, float(apart.max(initial=0.0)), 0.0 if same.all() else np.inf)
+        differ = ours != theirs  # −∞ does not differ from itself
+        ours, theirs = ours[differ], theirs[differ]
+        apart = np.abs(ours - theirs) / np.maximum(size, np.where(np.isinf(ours), size, abs(ours)))
+        largest = float(np.maximum(largest, apart.max(initial=0.0)))
     if not largest <= TOLERANCE:
         raise InputError(
             f"what onnxruntime computes differs from torch's by {largest:.2g}, more than "
@@ -322,8 +304,14 @@ def _write_graph(
         outputs: their names.
         shapes: sizes that may vary; None for those of the example alone.
     """
+    level = logging.root.manager.disable
     try:
-        with _quiet(), torch.no_grad():
+        logging.disable(logging.ERROR)
+        with (
+            warnings.catch_warnings(action="ignore"),
+            redirect_stdout(io.StringIO()),
+            torch.no_grad(),
+        ):
             # What is computed once must not be a part of the graph.
             module(*inputs.values())
             torch.onnx.export(
@@ -346,17 +334,6 @@ def _write_graph(
         raise InputError(
             f"torch cannot export policies of kind {kind!r} ({reason}); {remedy}"
         ) from None
-
-
-@contextlib.contextmanager
-def _quiet() -> Any:
-    """Keep the exporter from printing."""
-    level = logging.root.manager.disable
-    logging.disable(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
     finally:
         logging.disable(level)
 
@@ -369,26 +346,27 @@ def _describe_graph(
 ) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
     rule, record, dropped = scorer.rule, trained.record, trained.record.dropped_observations
-    described_inputs, described_outputs = (
-        [
+
+    def describe(tensors: dict[str, Tensor]) -> list[dict[str, Any]]:
+        return [
             {
                 "name": name,
                 "dtype": str(tensor.dtype).removeprefix("torch."),
-                "shape": ["batch", "excluded_items"]
-                if name == _EXCLUDED
-                else ["batch", *tensor.shape[1:]],
+                "shape": [
+                    "batch",
+                    *(["excluded_items"] if name == _EXCLUDED else tensor.shape[1:]),
+                ],
                 "meaning": _MEANINGS[name],
             }
             for name, tensor in tensors.items()
         ]
-        for tensors in (inputs, outputs)
-    )
+
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
-        "inputs": described_inputs,
-        "outputs": described_outputs,
+        "inputs": describe(inputs),
+        "outputs": describe(outputs),
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
         "rule_notes": _NOTES,

@@ -128,23 +128,19 @@ def _read_plain(frame: pd.DataFrame, by_id: bool, duplicates: str) -> Histories 
     table |= {schema.REWARD: rewards, "row": np.arange(len(frame))}
     order = choose_rows(table, duplicates)
     table = {name: values[order] for name, values in table.items()}
-    users, items = table["user"], table[schema.ITEM]
-    same_user = users[1:] == users[:-1]
-    owner = np.concatenate([[0], np.cumsum(~same_user)])
-    ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
-    recent = ends[owner] - np.arange(len(users)) < LONGEST_HISTORY
-    by_item = np.lexsort((items, owner))
-    seen_owner, seen = owner[by_item], items[by_item]
-    new = np.append(True, (np.diff(seen_owner) > 0) | (np.diff(seen) != 0))
+    users, owner, counts = np.unique(table["user"], return_inverse=True, return_counts=True)
+    recent = np.cumsum(counts)[owner] - np.arange(len(owner)) <= LONGEST_HISTORY
+    items, codes = np.unique(table[schema.ITEM], return_inverse=True)
+    seen_owner, seen = np.divmod(np.unique(owner * len(items) + codes), len(items))
     return Histories(
-        users=users[ends],
+        users=users,
         owner=owner[recent],
-        item_ids=items[recent],
+        item_ids=table[schema.ITEM][recent],
         rewards=table[schema.REWARD][recent].astype(np.float32),
         timestamps=table[schema.TIMESTAMP][recent],
         session_ids=table["session"][recent] if by_id else None,
-        seen_owner=seen_owner[new],
-        seen_ids=seen[new],
+        seen_owner=seen_owner,
+        seen_ids=items[seen],
         observations=None,
     )
 

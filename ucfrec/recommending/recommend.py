@@ -221,10 +221,9 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
     in_catalogue = numbers >= 0
     if not (in_catalogue.any() if skip_unknown else in_catalogue.all()):
         unknown = ids[~in_catalogue].tolist()
-        remedy = "name items of its catalogue" if skip_unknown else "leave them out"
         raise InputError(
             f"{len(unknown)} of {len(ids)} named items are not known to the policy "
-            f"({name_some(unknown)}); {remedy}"
+            f"({name_some(unknown)}); name items of its catalogue"
         )
     return numbers[in_catalogue]
 
@@ -412,18 +411,19 @@ def similar_items(
     if scorer.has_factors:
         vectors = torch.from_numpy(scorer.vectors()[:, :-1])
     vectors = F.normalize(vectors, dim=1)
-    all_numbers = candidate_numbers(trained.items, chosen, skip_unknown=False)
+    numbers = candidate_numbers(trained.items, chosen, skip_unknown=False)
     k = min(k, len(ids) - 1)
-    frames = []
-    for begin in range(0, len(all_numbers), _ITEMS_AT_ONCE):
-        numbers = torch.from_numpy(all_numbers[begin : begin + _ITEMS_AT_ONCE])
-        cosines = (vectors[numbers] @ vectors.T).scatter(1, numbers.unsqueeze(1), -torch.inf)
+    parts = []
+    for some in torch.split(torch.from_numpy(numbers), _ITEMS_AT_ONCE):
+        cosines = (vectors[some] @ vectors.T).scatter(1, some.unsqueeze(1), -torch.inf)
         best = best_items(cosines, k)
-        columns = {
-            schema.ITEM_ID: ids[numbers.numpy().repeat(k)],
+        parts.append((best, cosines.gather(1, best)))
+    similar, scores = (torch.cat(values).flatten().numpy() for values in zip(*parts, strict=True))
+    return pd.DataFrame(
+        {
+            schema.ITEM_ID: ids[numbers.repeat(k)],
             RANK: np.tile(np.arange(1, k + 1), len(numbers)),
-            SIMILAR_ITEM: ids[best.numpy().ravel()],
-            SCORE: cosines.gather(1, best).numpy().ravel(),
+            SIMILAR_ITEM: ids[similar],
+            SCORE: scores,
         }
-        frames.append(pd.DataFrame(columns))
-    return pd.concat(frames, ignore_index=True)
+    )

@@ -5,11 +5,10 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Final, NotRequired
+from typing import Annotated, Any, Final, NamedTuple, NotRequired
 
 import duckdb
 import numpy as np
@@ -29,7 +28,7 @@ from pydantic import (
 from typing_extensions import TypedDict
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Array, Float32Array
 from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.engine import bind, engine, explain_errors
@@ -37,8 +36,6 @@ from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable, Histories
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.logs.tables import is_number
-from ucfrec.runs.later_logs import reward_of
-from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
@@ -164,12 +161,8 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
 
 def _describe(errors: Sequence[Any]) -> str:
     """The first of pydantic's errors in one line, and how many there are: one a place."""
-    first, places = errors[0], []
-    for error in errors:
-        place, kind = error["loc"], error["type"]
-        # That of an error in one of the types that a place takes ends with the type.
-        of_type = kind != "extra_forbidden" and place and place[-1] in _TYPES
-        places.append(place[:-1] if of_type else place)
+    first = errors[0]
+    places = [tuple(part for part in error["loc"] if part not in _TYPES) for error in errors]
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_uncapitalise(first['msg'])})"
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
@@ -258,14 +251,13 @@ class RowRewards:
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
     """The entry `name` of each row, in whatever case it is written; None where there is none."""
-    values = [row.get(name) for row in rows]
-    if any(value is None for value in values):
-        folded = name.casefold()
-        for column in set().union(*rows) - {name}:
-            if column.casefold() == folded:
-                more = (row.get(column) for row in rows)
-                values = [b if a is None else a for a, b in zip(values, more, strict=True)]
-    return values
+    folded = name.casefold()
+    return [
+        next((row[n] for n in row if n.casefold() == folded and row[n] is not None), None)
+        if row.get(name) is None
+        else row[name]
+        for row in rows
+    ]
 
 
 def _require_numbers(values: Sequence[Any], missing: str) -> list[float]:
@@ -281,8 +273,7 @@ def _require_numbers(values: Sequence[Any], missing: str) -> list[float]:
     return [float(value) for value in values]
 
 
-@dataclass(frozen=True)
-class HistoryReader:
+class HistoryReader(NamedTuple):
     """Cleans the rows of requests as `ucfrec recommend` cleans those of a log."""
 
     duplicates: str
@@ -291,16 +282,7 @@ class HistoryReader:
     observation_size: int
     """Of the logs: columns that the policy does not see are given too."""
     rewards: RowRewards
-
-    @classmethod
-    def of(cls, trained: TrainedPolicy) -> "HistoryReader":
-        """The reader for a policy; its `rewards` have to be closed."""
-        return cls(
-            trained.record.data.duplicates,
-            trained.record.session_by == schema.SESSION_ID,
-            trained.logged_observation_size,
-            RowRewards(reward_of(trained)),
-        )
+    """Has to be closed."""
 
     def read(self, rows: Sequence[Row], user_id: int | str) -> Histories:
         """The history of the rows of one user; InputError for a row that lacks something, or has a
@@ -324,12 +306,15 @@ class HistoryReader:
             sessions = id_array(ids)
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
-            observed = [row.get("observation") or () for row in rows]
+            observed: list[Any] = [row.get("observation") or () for row in rows]
             if {*map(len, observed)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
         order = choose_rows(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
-        observations = self._read_observation(rows, order[-1:])
+        observations = None
+        if self.observation_size:
+            latest = int(order[-1])
+            observations = self._require_observation(observed[latest], latest)
         seen = pd.unique(items)
         return Histories(
             users=id_array([user_id]),
@@ -343,20 +328,15 @@ class HistoryReader:
             observations=observations,
         )
 
-    def _read_observation(self, rows: Sequence[Row], last: IntArray) -> Float32Array | None:
-        """The observation (1, O) of the last row (1,); None if the policy has none."""
-        if not self.observation_size:
-            return None
-        number = int(last[0])
-        values = rows[number].get("observation") or []
+    def _require_observation(self, values: Sequence[float], row: int) -> Float32Array:
         if len(values) != self.observation_size:
             raise InputError(
-                f"history.{number}: the observation has {len(values)} numbers; the policy needs "
+                f"history.{row}: the observation has {len(values)} numbers; the policy needs "
                 f"{self.observation_size}"
             )
         if max(map(abs, values)) > _LARGEST_FLOAT:
             raise InputError(
-                f"history.{number}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
+                f"history.{row}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
             )
         return np.asarray([values], dtype=np.float32)
 

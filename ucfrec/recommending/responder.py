@@ -4,7 +4,9 @@ or by several that share the users, replaced as the server runs."""
 import sys
 import threading
 import time
+from bisect import bisect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from uuid import uuid4
@@ -18,9 +20,11 @@ from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.recommending.exposures import exposure_schema
 from ucfrec.recommending.recommend import Chooser, candidate_numbers, name_some
-from ucfrec.recommending.requests import HistoryReader, Limits, Request, id_array
+from ucfrec.recommending.requests import HistoryReader, Limits, Request, RowRewards, id_array
+from ucfrec.runs.later_logs import reward_of
 from ucfrec.runs.promoted import POINTER, Promoted, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.schema import SESSION_ID
 
 ONNXRUNTIME: Final = "onnxruntime"
 _LARGEST_EXACT: Final = 2**53 - 1
@@ -124,14 +128,19 @@ class Responder:
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
         if engine == ONNXRUNTIME:
-            from ucfrec.recommending.export import ScoreGraph
+            from ucfrec.recommending.export import compile_scores
 
-            scorer.engine = ScoreGraph(scorer, trained.name)
+            scorer.engine = compile_scores(scorer, trained.name)
         self.trained, self.limits, self.rule = trained, limits, scorer.rule
         self._chooser = Chooser(trained, scorer, seed)
         self._k, self._filter_seen, self._skip_unknown = k, filter_seen, skip_unknown
         self._source = trained.fingerprint, self.rule.hash
-        self._reader = HistoryReader.of(trained)
+        self._reader = HistoryReader(
+            trained.record.data.duplicates,
+            trained.record.session_by == SESSION_ID,
+            trained.logged_observation_size,
+            RowRewards(reward_of(trained)),
+        )
         self._unknown = {"unknown_items": Mean(0, 0), "unknown_users": Mean(0, 0)}
 
     def drift(self) -> dict[str, Mean]:
@@ -224,11 +233,7 @@ def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
     """Index of a user's arm of those with the shares, which add up to 1: users are divided by a
     hash of their identifier, the same for ever."""
     place = xxhash.xxh3_64_intdigest(f"arm {user_id}".encode()) % _UNITS / _UNITS
-    for number, share in enumerate(shares):
-        place -= share
-        if place < 0:
-            return number
-    return len(shares) - 1
+    return bisect(list(accumulate(shares[:-1])), place)
 
 
 def parse_split(text: str) -> dict[str, float]:
@@ -355,18 +360,15 @@ class Served:
         return pointer, (self._folder / POINTER).stat().st_mtime_ns
 
     def _run(self, seconds: float) -> None:
-        previous = ""
         while not self._closed.wait(seconds):
-            message = ""
             try:
                 self.check()
             except Exception as error:
                 # Whatever is wrong with the pointer file, the run that answers goes on.
-                message = str(error)
-                self._refused, self._known = (POINTER, message), None
-            if message not in ("", previous):
-                _say(message)
-            previous = message
+                refused = POINTER, str(error)
+                if refused != self._refused:
+                    _say(refused[1])
+                self._refused, self._known = refused, None
 
     def _replace(self, pointer: Promoted) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""

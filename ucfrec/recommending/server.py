@@ -51,17 +51,17 @@ class _Connection(H11Protocol):
     httptools does neither, and saves 5% of the processor time at most.
     """
 
-    def __init__(self, seconds: float, most: int, of_address: int, *server: Any, **named: Any):
-        super().__init__(*server, **named)
+    def __init__(self, seconds: float, most: int, of_address: int, *server: Any, **options: Any):
+        super().__init__(*server, **options)
         self._seconds, self._most, self._of_address = seconds, most, of_address
-        self._before: tuple[object, int] | None = None
+        self._previous: tuple[object, int] | None = None
         self._timer = self.loop.call_later(seconds, self._check)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        others: Any = self.connections
-        same = sum(other.client[0] == self.client[0] for other in others) if self.client else 0
-        if len(others) > self._most or same > self._of_address:
+        peers: Any = self.connections
+        same = sum(peer.client[0] == self.client[0] for peer in peers) if self.client else 0
+        if len(peers) > self._most or same > self._of_address:
             transport.write(_TOO_MANY)
             transport.close()
 
@@ -79,9 +79,9 @@ class _Connection(H11Protocol):
         last check, nothing of an answer was taken, or the body of a request has not become
         whole."""
         cycle, unsent = self.cycle, self.transport.get_write_buffer_size()
-        before, self._before = self._before, (cycle, unsent)
+        previous, self._previous = self._previous, (cycle, unsent)
         idle = not unsent and (cycle is None or cycle.response_complete)
-        if idle or (before == self._before and (unsent or cycle.more_body)):
+        if idle or (previous == self._previous and (unsent or cycle.more_body)):
             self.transport.abort()
         else:
             self._timer = self.loop.call_later(self._seconds, self._check)

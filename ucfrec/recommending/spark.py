@@ -73,14 +73,14 @@ def _recommend_part(
 ) -> int:
     """Write the files of a part; returns the number of recommended items. A worker calls it
     (`ucfrec.logs.spark.Work`)."""
-    trained, (out, *shown) = run.load(), (folder / part_name(part) for folder in folders)
+    trained, (out, *exposures) = run.load(), (folder / part_name(part) for folder in folders)
     by, duplicates = session_by(trained), trained.record.data.duplicates
     histories = read_histories(
         [rows], mapping, "reward", LONGEST_HISTORY, memory_limit, by, duplicates
     )
     frames = recommended(trained, histories)
     with ExitStack() as stack:
-        for path in shown:
+        for path in exposures:
             rule = recommended.keywords["rule"].hash
             frames = stack.enter_context(exposures_written(path, trained, rule, frames))
         return write_frames(out, frames)

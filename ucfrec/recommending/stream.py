@@ -1,13 +1,13 @@
 """Recommendations as a stream: lines of requests in, lines of answers out."""
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.exposures import ExposureLog
-from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parse
+from ucfrec.recommending.requests import Request, Row, StreamRequest, parse
 from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
@@ -17,8 +17,8 @@ _AT_ONCE: Final = 256
 """Most requests of a forward pass."""
 
 
-_Line = tuple[int, bytes | None]
-"""Number of a line, from 1, and what it holds; None if it is too long."""
+_Line = tuple[int, bytes]
+"""Number of a line, from 1, and what it holds."""
 _Read = tuple[int, StreamRequest | InputError]
 """Number of a line, and the request, or what is wrong with it."""
 
@@ -41,90 +41,74 @@ def answer_stream(
         remember: rows that are remembered, of all users together.
         exposures: gets every answer; None for none.
     """
-    counts, remembered = Counter[str](), _Remembered(remember, responder.limits)
+    counts, answers = Counter[str](), _Answers(responder, remember, exposures)
     for lines in _read_lines(source, responder.limits.bytes):
-        for answer in _answer(responder, remembered, lines, exposures):
+        for answer in answers.answer(lines):
             sink.write(json_text(answer).encode() + b"\n")
             counts["errors" if "error" in answer else "answers"] += 1
         sink.flush()
     return counts
 
 
-def _answer(
-    responder: Responder,
-    remembered: "_Remembered",
-    lines: Sequence[_Line],
-    exposures: ExposureLog | None,
-) -> Iterator[dict[str, Any]]:
-    """The answers to lines."""
-    waiting: list[_Read] = []
-    users: set[str | int] = set()
-    for number, line in lines:
-        request = _parse_line(line, responder.limits)
-        user = number if isinstance(request, InputError) else str(request.user_id)
-        # Whether rows are remembered is known once they have been answered.
-        if user in users or len(waiting) == _AT_ONCE:
-            yield from _answer_together(responder, remembered, waiting, exposures)
-            waiting, users = [], set()
-        waiting.append((number, request))
-        users.add(user)
-    yield from _answer_together(responder, remembered, waiting, exposures)
+class _Answers:
+    """Answers lines, and remembers the rows of the users who were heard of last; user 7 is user
+    "7"."""
 
-
-def _parse_line(line: bytes | None, limits: Limits) -> StreamRequest | InputError:
-    try:
-        if line is None:
-            raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
-        if not line.strip():
-            raise InputError("the line is blank; send a request on each line")
-        request: StreamRequest = parse(StreamRequest, line, limits)
-    except InputError as error:
-        return error
-    return request
-
-
-def _answer_together(
-    responder: Responder,
-    remembered: "_Remembered",
-    waiting: Sequence[_Read],
-    exposures: ExposureLog | None,
-) -> Iterator[dict[str, Any]]:
-    """The answers to requests of different users, with one forward pass."""
-    whole = {n: remembered.whole(r) for n, r in waiting if isinstance(r, StreamRequest)}
-    answers = dict(zip(whole, responder.answers(list(whole.values())), strict=True))
-    for number, request in waiting:
-        if isinstance(request, InputError):
-            yield {"error": str(request), "line": number}
-            continue
-        answer = answers[number]
-        if isinstance(answer, InputError):
-            yield {"user_id": exact_id(request.user_id), "error": str(answer), "line": number}
-        else:
-            remembered.keep(request, whole[number].history)
-            if exposures is not None:
-                exposures.add(request.user_id, answer)
-            yield answer.as_dict(request.user_id)
-
-
-class _Remembered:
-    """The rows of the users who were heard of last; user 7 is user "7"."""
-
-    def __init__(self, most: int, limits: Limits) -> None:
-        self._most, self._limits, self._count = most, limits, 0
+    def __init__(self, responder: Responder, most: int, exposures: ExposureLog | None) -> None:
+        self._responder, self._exposures = responder, exposures
+        self._most, self._count = most, 0
         self._rows: OrderedDict[str, list[Row]] = OrderedDict()
 
-    def whole(self, request: StreamRequest) -> Request:
+    def answer(self, lines: Sequence[_Line]) -> Iterator[dict[str, Any]]:
+        """The answers to lines."""
+        waiting: dict[str | int, _Read] = {}
+        for number, line in lines:
+            request = self._parse_line(line)
+            user = number if isinstance(request, InputError) else str(request.user_id)
+            # Whether rows are remembered is known once they have been answered.
+            if user in waiting or len(waiting) == _AT_ONCE:
+                yield from self._answer_together(waiting.values())
+                waiting = {}
+            waiting[user] = number, request
+        yield from self._answer_together(waiting.values())
+
+    def _parse_line(self, line: bytes) -> StreamRequest | InputError:
+        if not line.strip():
+            return InputError("the line is blank; send a request on each line")
+        try:
+            request: StreamRequest = parse(StreamRequest, line, self._responder.limits)
+        except InputError as error:
+            return error
+        return request
+
+    def _answer_together(self, waiting: Collection[_Read]) -> Iterator[dict[str, Any]]:
+        """The answers to requests of different users, with one forward pass."""
+        whole = {n: self._add_history(r) for n, r in waiting if isinstance(r, StreamRequest)}
+        answers = dict(zip(whole, self._responder.answers(list(whole.values())), strict=True))
+        for number, request in waiting:
+            if isinstance(request, InputError):
+                yield {"error": str(request), "line": number}
+                continue
+            answer = answers[number]
+            if isinstance(answer, InputError):
+                yield {"user_id": exact_id(request.user_id), "error": str(answer), "line": number}
+            else:
+                self._remember(str(request.user_id), whole[number].history)
+                if self._exposures is not None:
+                    self._exposures.add(request.user_id, answer)
+                yield answer.as_dict(request.user_id)
+
+    def _add_history(self, request: StreamRequest) -> Request:
         """The request with all rows of its user as its history."""
-        replaced = "history" in request.model_fields_set
+        replaced, most = "history" in request.model_fields_set, self._responder.limits.history
         earlier = request.history if replaced else self._rows.get(str(request.user_id), [])
         rows = [*earlier, *request.interactions]
-        if len(rows) > self._limits.history:
-            rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
+        if len(rows) > most:
+            rows = sorted(rows, key=lambda row: row["timestamp"])[-most:]
         return request.model_copy(update={"history": rows})
 
-    def keep(self, request: StreamRequest, rows: list[Row]) -> None:
+    def _remember(self, user: str, rows: list[Row]) -> None:
         """Remember all rows of a user, if there are any."""
-        user = str(request.user_id)
         self._count += len(rows) - len(self._rows.pop(user, ()))
         if rows:
             self._rows[user] = rows
@@ -133,20 +117,13 @@ class _Remembered:
 
 
 def _read_lines(source: IO[bytes], most: int) -> Iterator[list[_Line]]:
-    """Lines that arrive together; None for one of over `most` bytes."""
-    number, buffer, too_long = 0, bytearray(), False
+    """Lines that arrive together; of one of over `most` bytes, one byte more than these or all."""
+    number, buffer = 0, b""
     while block := source.read(_BLOCK):
-        first, *following_parts = block.split(b"\n")
-        buffer += first
-        lines: list[_Line] = []
-        for following in following_parts:
-            number += 1
-            whole = not (too_long or len(buffer) > most)
-            lines.append((number, bytes(buffer) if whole else None))
-            buffer, too_long = bytearray(following), False
-        if len(buffer) > most:
-            buffer, too_long = bytearray(), True
+        *lines, buffer = (buffer + block).split(b"\n")
+        buffer = buffer[: most + 1]
         if lines:
-            yield lines
-    if buffer or too_long:
-        yield [(number + 1, None if too_long else bytes(buffer))]
+            yield [*enumerate(lines, number + 1)]
+        number += len(lines)
+    if buffer:
+        yield [(number + 1, buffer)]

@@ -205,16 +205,50 @@ class _Batcher:
 
     def __init__(
         self,
-        answers: Callable[[Sequence[Request]], list[Answer | InputError]],
-        metrics: _Metrics,
+        responder: Responder | Served,
         limits: ServerLimits,
+        exposures: ExposureLog | None,
+        metrics: _Metrics,
     ) -> None:
-        self._answers, self._metrics, self._limits = answers, metrics, limits
+        self._responder, self._limits = responder, limits
+        self._exposures, self._metrics = exposures, metrics
         self._queue: deque[_Waiting] = deque()
         self._thread = ThreadPoolExecutor(1, "forward")
         self._running: asyncio.Task[None] | None = None
 
-    async def answer(self, request: Request) -> Answer:
+    async def respond(self, http: HTTPRequest) -> Response:
+        """The next items for one user."""
+        began = time.perf_counter()
+        status, body = await self._answer_http(http)
+        self._metrics.count_request(status, time.perf_counter() - began)
+        return _respond(status, body, {"Retry-After": "1"} if status == 503 else None)
+
+    async def _answer_http(self, http: HTTPRequest) -> tuple[int, dict[str, Any]]:
+        """HTTP status and JSON of the answer."""
+        seconds, limits, arrived = self._limits.timeout, self._responder.limits, False
+        try:
+            async with asyncio.timeout(seconds):
+                body = await _read_body(http, limits.bytes)
+                arrived = True
+                request: Request = parse(Request, body, limits)
+                answer = await self._answer(request)
+        except HTTPException as error:
+            return error.status_code, {"error": error.detail}
+        except InputError as error:
+            return 400, {"error": str(error)}
+        except TimeoutError:
+            status = 504 if arrived else 408
+            return status, {"error": f"not done within {seconds:g} s; try again later"}
+        except ClientDisconnect:
+            return _HUNG_UP, {"error": "the client closed the connection"}
+        except Exception:
+            traceback.print_exc(file=sys.stderr)
+            return 500, {"error": "internal error (a bug, or out of memory); see the server's log"}
+        if self._exposures is not None:
+            self._exposures.add(request.user_id, answer)
+        return 200, answer.as_dict(request.user_id)
+
+    async def _answer(self, request: Request) -> Answer:
         """The answer to a request; InputError for a wrong one, HTTPException if too many wait."""
         if len(self._queue) >= self._limits.queue:
             raise HTTPException(503, "too many requests wait; try again later")
@@ -237,7 +271,7 @@ class _Batcher:
             outcomes: Sequence[Answer | Exception]
             try:
                 outcomes = await asyncio.get_running_loop().run_in_executor(
-                    self._thread, self._answers, requests
+                    self._thread, self._responder.answers, requests
                 )
             except Exception as error:  # a bug, or out of memory; every caller receives it
                 outcomes = [error] * len(batch)
@@ -297,7 +331,7 @@ def application(
     """
     hosts = [_read_host(host) for host in allowed_hosts]
     metrics = _Metrics(responder.drift, shared_metrics)
-    batcher = _Batcher(responder.answers, metrics, limits)
+    batcher = _Batcher(responder, limits, exposures, metrics)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -317,20 +351,18 @@ def application(
         status: {"description": text, "model": _Error} for status, text in _FAULTS.items()
     }
 
-    @app.post(
+    # For OpenAPI, a JSON schema without references, which lie elsewhere.
+    schema = Request.model_json_schema()
+    schema["properties"]["history"]["items"] = schema.pop("$defs")["Row"]
+    body = {"required": True, "content": {_JSON: {"schema": schema}}}
+    app.post(
         _PATH,
-        openapi_extra=_describe_requests(),
+        name="recommendations",
+        openapi_extra={"requestBody": body},
         responses=faults,
         response_model=_Recommendations,
-    )
-    async def recommendations(http: HTTPRequest) -> Response:
-        """The next items for one user."""
-        began = time.perf_counter()
-        status, body = await _answer_http(http, responder, batcher, limits, exposures)
-        metrics.count_request(status, time.perf_counter() - began)
-        return _respond(status, body, {"Retry-After": "1"} if status == 503 else None)
-
-    app.add_middleware(_Entrance, answer=recommendations)
+    )(batcher.respond)
+    app.add_middleware(_Entrance, answer=batcher.respond)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
 
     @app.get("/health")
@@ -358,38 +390,6 @@ def _read_host(host: str) -> str:
     return host
 
 
-async def _answer_http(
-    http: HTTPRequest,
-    responder: Responder | Served,
-    batcher: _Batcher,
-    limits: ServerLimits,
-    exposures: ExposureLog | None,
-) -> tuple[int, dict[str, Any]]:
-    """HTTP status and JSON of the answer."""
-    arrived = False
-    try:
-        async with asyncio.timeout(limits.timeout):
-            body = await _read_body(http, responder.limits.bytes)
-            arrived = True
-            request: Request = parse(Request, body, responder.limits)
-            answer = await batcher.answer(request)
-    except HTTPException as error:
-        return error.status_code, {"error": error.detail}
-    except InputError as error:
-        return 400, {"error": str(error)}
-    except TimeoutError:
-        status = 504 if arrived else 408
-        return status, {"error": f"not done within {limits.timeout:g} s; try again later"}
-    except ClientDisconnect:
-        return _HUNG_UP, {"error": "the client closed the connection"}
-    except Exception:
-        traceback.print_exc(file=sys.stderr)
-        return 500, {"error": "internal error (a bug, or out of memory); see the server's log"}
-    if exposures is not None:
-        exposures.add(request.user_id, answer)
-    return 200, answer.as_dict(request.user_id)
-
-
 async def _read_body(http: HTTPRequest, most: int) -> bytes:
     """The body of a request, of which no more than `most` bytes are read."""
     body = bytearray()
@@ -403,10 +403,3 @@ async def _read_body(http: HTTPRequest, most: int) -> bytes:
 def _respond(status: int, body: Any, headers: Any = None) -> Response:
     # One-line errors may quote text that is not Unicode; \u escapes can carry it.
     return Response(json_text(body), status, headers, media_type=_JSON)
-
-
-def _describe_requests() -> dict[str, Any]:
-    """The body of requests, for OpenAPI: a JSON schema without references, which lie elsewhere."""
-    schema = Request.model_json_schema()
-    schema["properties"]["history"]["items"] = schema.pop("$defs")["Row"]
-    return {"requestBody": {"required": True, "content": {_JSON: {"schema": schema}}}}

@@ -301,7 +301,7 @@ MOST_CLUSTERS = 10_000
 """Of more, random groups are drawn: the error stays, and time and memory are bounded."""
 FEWEST_USERS = 10
 """Users below which their spread says too little for a conclusion."""
-_COUNTS_AT_ONCE = 2**22
+_CLUSTERS_AT_ONCE = 2**10
 _USABLE = 0.9
 """Share of resamples that must have a spread of their own."""
 
@@ -389,18 +389,15 @@ def resample(
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
     moments = np.concatenate([e, b, e * e, e * b, b * b], axis=1)
-    counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
-    shifts, spreads = [], []
-    for begin in range(0, RESAMPLES, at_once):
-        # How often each cluster is drawn stands for the resampled rows.
-        times = counts[begin : begin + at_once].astype(np.float64)
-        e, b, ee, eb, bb = (times @ moments).reshape(-1, 5, len(value)).swapaxes(0, 1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            shift = np.where(b > 0, e / b, np.nan)
-            spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
-            spreads.append(correction * np.sqrt(spread) / b * unit)
-        shifts.append(shift * unit)
-    shift, errors, error_in_units = np.concatenate(shifts), np.concatenate(spreads), error * unit
+    # How often each cluster is drawn stands for the resampled rows; as floats, some at a time.
+    counts = np.array_split(_draw_counts(clusters, seed), max(1, clusters // _CLUSTERS_AT_ONCE))
+    sums = np.concatenate([times.astype(np.float64) @ moments for times in counts])
+    e, b, ee, eb, bb = sums.reshape(-1, 5, len(value)).swapaxes(0, 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = np.where(b > 0, e / b, np.nan)
+        spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
+        errors = correction * np.sqrt(spread) / b * unit
+    shift, error_in_units = shift * unit, error * unit
     differ = (error > 1e-12) & (clusters > 1)
     usable = differ & np.isfinite(shift) & (errors > 1e-9 * error_in_units)
     studentised = np.full(shift.shape, np.nan)
@@ -433,12 +430,7 @@ def _draw_counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
     """(B, C) how often each resample has each cluster, at most 40 MB; kept for the next call."""
     generator = np.random.default_rng(seed)
     counts = np.empty((RESAMPLES, clusters), dtype=np.uint16)
-    at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))
-    for begin in range(0, RESAMPLES, at_once):
-        draws = min(at_once, RESAMPLES - begin)
-        picked = generator.integers(clusters, size=(draws, clusters))
-        picked += np.arange(draws)[:, None] * clusters
-        times = np.bincount(picked.ravel(), minlength=draws * clusters)
-        counts[begin : begin + draws] = times.reshape(draws, clusters)
+    for times in counts:
+        times[:] = np.bincount(generator.integers(clusters, size=clusters), minlength=clusters)
     counts.setflags(write=False)
     return counts

@@ -430,13 +430,13 @@ def collect_steps(
     declared, unknown = "", int(np.isnan(propensity).sum())
     if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
         group = np.maximum(groups.number, 0)
-        behavior = fit_behavior(inputs.states, items, group, plain.session, seed, plain.user)
+        owner = plain.users[plain.session]
+        behavior = fit_behavior(inputs.states, items, group, owner, seed)
         of_group = np.take_along_axis(groups.target, group[:, None], axis=1)[:, 0]
         columns["cluster_propensity"] = behavior.group
         columns["cluster_target"] = np.where(groups.number < 0, 0.0, of_group).clip(0, 1)
         if options.estimate_propensities and unknown:
             declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
             columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
-    reward, session = plain.reward, plain.session
-    modelled, models = fit_models(inputs.chunks, reward, session, seed, plain.user, plain.discount)
+    modelled, models = fit_models(inputs.chunks, plain, seed)
     return replace(plain, target=target, model=modelled, groups=groups, **columns), models, declared

@@ -231,31 +231,24 @@ class _GroupModel:
     def __init__(self, states: Float32Array, group: IntArray, shares: Float64Array) -> None:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
 
         self.shares, self._present, self._model = shares, np.unique(group), None
         # There may be no row at all, where all other users were shown unknown items.
         if len(self._present) > 1:
-            self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
-            self._spread[self._spread == 0] = 1.0
             require_blas_memory()
             model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
-            self._model = model.fit(self._scale(states), group)
+            self._model = make_pipeline(StandardScaler(), model).fit(states, group)
 
     def predict(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
-        scores = self._model.decision_function(self._scale(states)) / temperature
-        if scores.ndim == 1:
-            scores = np.stack([-scores / 2, scores / 2], axis=1)
+        scores = self._model.predict_log_proba(states) / temperature
         probabilities = np.zeros((len(states), len(self.shares)))
         probabilities[:, self._present] = softmax(scores, axis=1)
         return (1 - share) * probabilities + share * self.shares
-
-    def _scale(self, states: Float32Array) -> Float32Array:
-        scaled = np.asarray(states - self._mean, dtype=np.float32)
-        scaled /= self._spread
-        return scaled
 
 
 def _calibrate(

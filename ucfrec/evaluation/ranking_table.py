@@ -77,12 +77,11 @@ def same_for_all(items: Tensor) -> Ranker:
     return lambda _: items.unsqueeze(0)
 
 
-def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> Ranker:
+def neighbour_ranker(train: EpisodeStore, tie_break: Tensor) -> Ranker:
     """Ranks items by their cosine to the user's latest rewarded items, of all sessions, also before
     the log; ties go to the popular ones. See `ItemKNNPolicy`."""
     knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
     knn.start_from(train)
-    tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(steps: Steps) -> Tensor:
         items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
@@ -92,7 +91,7 @@ def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> Ranker:
 
 
 def factor_rankers(
-    train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
+    train: EpisodeStore, tie_break: Tensor, seed: int, liked_of: LikedOf
 ) -> Iterator[tuple[str, Ranker]]:
     """Rank items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
     and BPR (Rendle et al., 2009); needs the package `implicit`."""
@@ -104,10 +103,9 @@ def factor_rankers(
     users = owners[train.all_steps()[0]]
     items = train.column(schema.ITEM)
     liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
-    shape = (int(users.max()) + 1, len(popularity))
+    shape = (int(users.max()) + 1, len(tie_break))
     matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
     matrix.eliminate_zeros()
-    tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(of_users: Tensor, of_items: Tensor, steps: Steps) -> Tensor:
         rows = np.where(steps.users < len(of_users) - 1, steps.users, -1)
@@ -149,7 +147,8 @@ def baselines(
         "item click rate": same_for_all(shrink_rates(counts)),
     }
     if train is not None:
-        rankers["item-knn"] = neighbour_ranker(train, impressions.float())
+        tie_break = 1e-6 * impressions.float() / impressions.float().max()
+        rankers["item-knn"] = neighbour_ranker(train, tie_break)
         config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
         boosted = BoostedPolicy(config, policy_sizes(train))
         boosted.start_from(train)
@@ -161,7 +160,7 @@ def baselines(
 
         rankers["boosted clicks"] = scores
         if find_spec("implicit") is not None:
-            rankers |= factor_rankers(train, impressions.float(), seed, liked_of)
+            rankers |= factor_rankers(train, tie_break, seed, liked_of)
     if train is not None and store is not None and store.split("validation").n_episodes:
         first, validation = store.split("train"), store.split("validation")
         for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):

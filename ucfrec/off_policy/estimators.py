@@ -46,7 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.logged_steps import LoggedSteps, number_clusters
 from ucfrec.results.statistics import effective_number
 
 SUITE: Final = "off-policy"
@@ -253,14 +253,14 @@ class StepSums:
         rewarded = np.bincount(steps.step, steps.weights * left).astype(np.float64)
         return cls(len(steps.first), steps.step_totals(), rewarded)
 
-    def __add__(self, other: "StepSums") -> "StepSums":
-        totals, rewarded = np.zeros((2, max(len(self.totals), len(other.totals))))
-        for sums in (self, other):
+    def __add__(self, more: "StepSums") -> "StepSums":
+        totals, rewarded = np.zeros((2, max(len(self.totals), len(more.totals))))
+        for sums in (self, more):
             # Sessions that have ended keep the weight of their last step, and have no reward.
             padding = 0, len(totals) - len(sums.totals)
             totals += np.pad(sums.totals, padding, "edge")
             rewarded += np.pad(sums.rewarded, padding)
-        return StepSums(self.sessions + other.sessions, totals, rewarded)
+        return StepSums(self.sessions + more.sessions, totals, rewarded)
 
 
 def normalise_by_step(
@@ -370,7 +370,8 @@ def resample(
     above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
 ) -> Resamples:
     """Draw clusters with replacement, each with all its sessions: `cluster_intervals`."""
-    names, clusters = _number_clusters(cluster, len(above))
+    names = number_clusters(cluster, len(above))
+    clusters = int(names.max()) + 1
     if clusters > MOST_CLUSTERS:
         shuffled = np.random.default_rng(seed).permutation(clusters)
         names, clusters = shuffled[names] % MOST_CLUSTERS, MOST_CLUSTERS
@@ -381,11 +382,9 @@ def resample(
         for values in (above, below)
     )
     value = above.sum(axis=0) / below.sum(axis=0)
-    # Deviations from the estimate, in units that keep squares of large weights finite.
-    scale = np.maximum(np.abs(above - value * below).max(axis=0), np.finfo(float).tiny)
+    # In units that keep squares of large weights finite.
     size = np.abs(below).max(axis=0)
-    e, b = (above - value * below) / scale, below / size
-    unit = scale / size
+    e, b = (above - value * below) / size, below / size
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
     moments = np.concatenate([e, b, e * e, e * b, b * b], axis=1)
@@ -396,33 +395,23 @@ def resample(
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(b > 0, e / b, np.nan)
         spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
-        errors = correction * np.sqrt(spread) / b * unit
-    shift, error_in_units = shift * unit, error * unit
-    differ = (error > 1e-12) & (clusters > 1)
-    usable = differ & np.isfinite(shift) & (errors > 1e-9 * error_in_units)
+        errors = correction * np.sqrt(spread) / b
+    usable = (clusters > 1) & np.isfinite(shift) & (errors > 1e-9 * error)
     studentised = np.full(shift.shape, np.nan)
     studentised[usable] = shift[usable] / errors[usable]
-    return Resamples(value, error_in_units, shift, studentised)
+    return Resamples(value, error, shift, studentised)
 
 
 def cluster_mean(
     values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
 ) -> tuple[float, float]:
     """Mean of values (S,), of weights (S,) if given, and its standard error over clusters (S,)."""
-    names, clusters = _number_clusters(cluster, len(values))
-    above = np.bincount(names, values if weights is None else values * weights, clusters)
-    below = np.bincount(names, weights, clusters)
+    names = number_clusters(cluster, len(values))
+    above = np.bincount(names, values if weights is None else values * weights)
+    below, clusters = np.bincount(names, weights), len(above)
     mean = above.sum() / below.sum()
     spread = np.square(above - mean * below).sum()
     return float(mean), float(np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum())
-
-
-def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
-    """(S,) clusters numbered from 0, and how many there are."""
-    if cluster is None:
-        return np.arange(sessions), sessions
-    names = np.unique(cluster, return_inverse=True)[1]
-    return names, int(names.max()) + 1
 
 
 @lru_cache(maxsize=1)

@@ -208,8 +208,9 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **{f"model_{name}": value for name, value in asdict(models).items()},
     }
-    evidence = Evidence(steps, len(steps.reward), columns, declared=declared, models=models)
-    evidence.fingerprint = store.record.fingerprint
+    evidence = Evidence(
+        steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
+    )
     _doubt_logs(evidence, logged, options.pages)
     items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
@@ -268,7 +269,7 @@ def make_report(
         filter_seen=options.filter_seen,
     )
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
-    judged = evidence.columns | asdict(verdict) | diagnosis.as_columns()
+    judged = evidence.columns | asdict(verdict) | diagnosis.list_columns()
     judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
     del judged["estimator"], judged["reasons"]
     record, of_steps = trained.record, {} if per_step is None else per_step.estimates

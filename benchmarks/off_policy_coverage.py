@@ -125,7 +125,7 @@ class Environment:
         at_policy = np.einsum("xa,xaf->xf", target, one_hot)[contexts].astype(np.float32)
         ones = np.ones((len(contexts), 1), dtype=np.float32)
         features = (np.hstack([ones, seen]), np.hstack([ones, at_policy]))
-        model, _ = fit_models(lambda: iter([features]), steps.reward, steps.session, seed, user)
+        model, _ = fit_models(lambda: iter([features]), steps, seed)
         return replace(steps, model=model)
 
 

@@ -108,22 +108,17 @@ def alone(store: EpisodeStore) -> Later:
     return Later(store, UserRows.of(store, store.episode_values(schema.USER), None))
 
 
-class Oracle:
-    """Knows the halves."""
-
-    name = "oracle"
-
-    def scores(self, steps: Steps) -> Tensor:
-        own = torch.from_numpy(steps.users % 2).unsqueeze(1)
-        noise = torch.rand(len(steps.steps), 40, generator=torch.Generator().manual_seed(0))
-        return (torch.arange(40) % 2 == own).float() + 0.1 * noise
+def score_halves(steps: Steps) -> Tensor:
+    own = torch.from_numpy(steps.users % 2).unsqueeze(1)
+    noise = torch.rand(len(steps.steps), 40, generator=torch.Generator().manual_seed(0))
+    return (torch.arange(40) % 2 == own).float() + 0.1 * noise
 
 
 def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStore) -> None:
     train, test = store.split("train"), store.split("test")
-    rankers = [*baselines(TrainingCounts.of(train), train, seed=0), Oracle()]
+    rankers = baselines(TrainingCounts.of(train), train, seed=0) | {"oracle": score_halves}
     period = Period.of(test, test.episode_values(schema.USER))
-    ranked = {ranker.name: rank_steps(ranker, alone(test), 10) for ranker in rankers}
+    ranked = {name: rank_steps(ranker, alone(test), 10) for name, ranker in rankers.items()}
     found = compare(period, ranked, "oracle", seed=0)
     assert found["oracle"]["gauc"] > 0.9
     for name in ("random", "most shown", "most clicked", "item click rate"):
@@ -146,7 +141,7 @@ def test_the_size_of_the_last_batch_changes_nothing(
 ) -> None:
     train, test = store.split("train"), store.split("test")
     later = replace(alone(test), filter_seen=filter_seen)
-    rankers = baselines(TrainingCounts.of(train), train, seed=0)[1:]  # `random` draws by batch
+    rankers = [*baselines(TrainingCounts.of(train), train, seed=0).values()][1:]  # `random` draws
     whole = [rank_steps(ranker, later, 10) for ranker in rankers]
     monkeypatch.setattr(ranking, "_STEPS_AT_ONCE", (test.n_steps - left) // 2 or 1)
     for ranker, expected in zip(rankers, whole, strict=True):
@@ -168,7 +163,7 @@ def test_steps_that_the_filter_leaves_without_a_hit_are_counted(store: EpisodeSt
     assert later.share_out_of_reach() == pytest.approx(np.mean(repeats))
     assert alone(test).share_out_of_reach() == 0
     period = Period.of(test, users[np.cumsum(test.lengths) - test.lengths])
-    hits = value(measure(period, rank_steps(Oracle(), later, 39)), "hit_rate_shown")
+    hits = value(measure(period, rank_steps(score_halves, later, 39)), "hit_rate_shown")
     assert hits <= 1 - np.mean(repeats) + 1e-9
 
 
@@ -186,28 +181,24 @@ def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> Non
     other = EpisodeStore.from_arrays(
         changed, store.lengths, episodes=episodes, item_states=store.item_states
     ).split("test")
-    for ranker in baselines(TrainingCounts.of(train), train, seed=0)[1:]:
-        before = ranker.scores(alone(test).steps(at, filter_seen=False))
-        after = ranker.scores(alone(other).steps(at, filter_seen=False))
+    for ranker in [*baselines(TrainingCounts.of(train), train, seed=0).values()][1:]:
+        before = ranker(alone(test).steps(at, filter_seen=False))
+        after = ranker(alone(other).steps(at, filter_seen=False))
         torch.testing.assert_close(before, after, rtol=0, atol=0)
 
 
-class Sated:
-    """Scores every item lower after each liked step, whatever the item."""
-
-    name = "sated"
-
-    def scores(self, steps: Steps) -> Tensor:
-        liked = torch.from_numpy(steps.store.rewards_before(steps.episodes, steps.steps))
-        noise = torch.rand(len(steps.steps), 40, generator=torch.Generator().manual_seed(0))
-        return noise - liked.float().unsqueeze(1)
+def score_sated(steps: Steps) -> Tensor:
+    """Lower after each liked step, whatever the item."""
+    liked = torch.from_numpy(steps.store.rewards_before(steps.episodes, steps.steps))
+    noise = torch.rand(len(steps.steps), 40, generator=torch.Generator().manual_seed(0))
+    return noise - liked.float().unsqueeze(1)
 
 
 def test_rewards_within_the_period_do_not_rank_the_items_shown_in_it(store: EpisodeStore) -> None:
     """Of two steps of which one is liked, the earlier one's score is higher where it was liked."""
     test = store.split("test")
     period = Period.of(test, test.episode_values(schema.USER))
-    found = measure(period, rank_steps(Sated(), alone(test), 10))
+    found = measure(period, rank_steps(score_sated, alone(test), 10))
     assert value(found, "gauc") == pytest.approx(0.5, abs=0.12)
 
 
@@ -227,7 +218,7 @@ def test_a_later_log_is_ranked_as_recommend_would(tmp_path: Path, session_by: st
     )
     trained = policy.trained
     rule = replace(trained.rule, temperature=0.0)  # does not draw
-    ranker = PolicyRanker(trained, rule)
+    ranker = PolicyRanker(trained, rule).scores
     with read_logged_sessions(trained, [tmp_path / "after.parquet"], LogMapping()) as logged:
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)

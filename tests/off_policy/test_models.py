@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.logged_steps import steps_of
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.off_policy.logged_steps import Modelled
@@ -42,7 +43,7 @@ def test_a_file_gives_back_its_inputs(tmp_path: Path, monkeypatch: pytest.Monkey
         features = [np.concatenate(parts) for parts in zip(*file.chunks(), strict=True)]
         for mine, theirs in zip(features, zip(*expected, strict=True), strict=True):
             np.testing.assert_array_equal(mine, np.concatenate(theirs))
-    assert np.concatenate(list(file.states())).shape == (sum(sizes), 15)
+    assert file.states.shape == (sum(sizes), 15)
     assert not list(tmp_path.iterdir())
 
 
@@ -99,10 +100,9 @@ def behavior() -> tuple[Float32Array, Float64Array]:
 
 def test_probabilities_are_those_of_the_logging_policy() -> None:
     states, probabilities = behavior()
-    drawn, session = np.random.default_rng(1).random((STEPS, 1)), np.arange(STEPS)
+    drawn, user = np.random.default_rng(1).random((STEPS, 1)), np.arange(STEPS) // 4
     item = (drawn > probabilities.cumsum(axis=1)).sum(axis=1).clip(0, 8)
-    chunks = np.array_split(states, 7)
-    model = fit_behavior(lambda: iter(chunks), item, GROUP_OF[item], session, 0, session // 4)
+    model = fit_behavior(states, item, GROUP_OF[item], user, 0)
     true = probabilities[np.arange(STEPS), item]
     groups = np.stack([probabilities[:, group == GROUP_OF].sum(axis=1) for group in range(3)])
     of_group = groups[GROUP_OF[item], np.arange(STEPS)]
@@ -115,14 +115,11 @@ def test_probabilities_are_those_of_the_logging_policy() -> None:
 def test_users_are_predicted_by_models_of_others() -> None:
     """What one user does changes nothing of what is said of that user."""
     states, _ = behavior()
-    session = np.arange(STEPS)
+    user = np.arange(STEPS) // 4
     item = np.random.default_rng(3).integers(9, size=STEPS)
-    changed = np.where(session // 4 == 11, 0, item)
-    same = (item == changed) & (session // 4 == 11)
-    models = [
-        fit_behavior(lambda: iter([states]), one, GROUP_OF[one], session, 0, session // 4)
-        for one in (item, changed)
-    ]
+    changed = np.where(user == 11, 0, item)
+    same = (item == changed) & (user == 11)
+    models = [fit_behavior(states, one, GROUP_OF[one], user, 0) for one in (item, changed)]
     np.testing.assert_array_equal(models[0].item[same], models[1].item[same])
 
 
@@ -131,7 +128,7 @@ def test_unknown_items_are_left_alone(groups: IntArray) -> None:
     states, _ = behavior()
     item = np.where(np.arange(STEPS) % 5 == 0, -1, np.arange(STEPS) % 9)
     group = groups[np.maximum(item, 0)]
-    model = fit_behavior(lambda: iter([states]), item, group, np.arange(STEPS), 0)
+    model = fit_behavior(states, item, group, np.arange(STEPS), 0)
     assert (model.item[item < 0] == 1).all()
     # Items do not follow the state: each of nine, whatever it is.
     np.testing.assert_allclose(model.item[item >= 0], 1 / 9, rtol=0.1)
@@ -171,7 +168,7 @@ def fitted(
         for begin in range(0, len(features), rows):
             yield features[begin : begin + rows], features[begin : begin + rows]
 
-    return fit_models(chunks, reward, session, seed=0)
+    return fit_models(chunks, steps_of(reward, session), seed=0)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 512])
@@ -210,7 +207,8 @@ def test_q_that_runs_away_is_stopped_and_said() -> None:
     logged = np.hstack([ones, 1 + features[:, [1]] ** 2])
     five = logged * np.array([1, 5], dtype=np.float32)
 
-    report = fit_models(lambda: iter([(logged, five)]), np.abs(reward), session, seed=0)[1]
+    steps = steps_of(np.abs(reward), session)
+    report = fit_models(lambda: iter([(logged, five)]), steps, seed=0)[1]
     assert not report.converged
     assert report.iterations < 400
     assert np.isfinite(report.td_loss)
@@ -222,7 +220,7 @@ def test_users_are_never_judged_by_models_that_saw_them() -> None:
     features = np.column_stack([np.ones(100), rng.normal(size=(100, 3))]).astype(np.float32)
     mine, reward = user == 7, rng.normal(size=100)
     before, after = (
-        fit_models(lambda: iter([(features, features)]), rewards, session, 3, user)[0].q
+        fit_models(lambda: iter([(features, features)]), steps_of(rewards, session, user), 3)[0].q
         for rewards in (reward, np.where(mine, 50.0, reward))
     )
     np.testing.assert_array_equal(after[mine], before[mine])

@@ -23,6 +23,10 @@ def random_steps(
     return LoggedSteps(session, reward, propensity, target, model=model, discount=discount)
 
 
+def steps_of(reward: Float64Array, session: IntArray, user: IntArray | None = None) -> LoggedSteps:
+    return LoggedSteps(session, reward, np.ones(len(reward)), np.ones(len(reward)), user=user)
+
+
 def fitted(
     features: Float32Array,
     at_policy: Float32Array,
@@ -32,7 +36,8 @@ def fitted(
     user: IntArray | None = None,
 ) -> Modelled:
     """What models say of steps whose features are in memory."""
-    return fit_models(lambda: iter([(features, at_policy)]), reward, session, seed, user)[0]
+    steps = steps_of(reward, session, user)
+    return fit_models(lambda: iter([(features, at_policy)]), steps, seed)[0]
 
 
 def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:

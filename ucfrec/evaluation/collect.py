@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Catalog, Environment, Simulator, environment_items
 from ucfrec.files.atomic import atomic_folder, write_json
@@ -124,23 +124,17 @@ class _SessionLog:
             TIMESTAMP: pa.array(start + np.concatenate(self._numbers) * STEP_MS),
         }
         if self._items is None:
-            columns[ACTION] = _lists(actions)
+            columns[ACTION] = pa.array(list(actions.astype(np.float32)))
         else:
             columns[ITEM_ID] = pa.array(self._items[actions])
         columns[self._feedback] = pa.array(np.concatenate([step.rewards for step in steps]))
         observations = np.concatenate([step.observations for step in steps])
         if observations.shape[1]:
-            columns[OBSERVATION] = _lists(observations)
+            columns[OBSERVATION] = pa.array(list(observations.astype(np.float32)))
         propensities = [step.propensities for step in steps if step.propensities is not None]
         if len(propensities) == len(steps):
             columns[PROPENSITY] = pa.array(np.concatenate(propensities))
         return columns
-
-
-def _lists(rows: Array) -> pa.Array:
-    """`rows` (M, D) as a column of type list<float>."""
-    offsets = np.arange(len(rows) + 1, dtype=np.int32) * np.int32(rows.shape[1])
-    return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())
 
 
 def collect_store(environment: Environment, folder: Path, sessions: int, seed: int) -> Path:
@@ -151,8 +145,8 @@ def collect_store(environment: Environment, folder: Path, sessions: int, seed: i
     if not logs.exists():
         behavior = simulator.logging_behavior
         env, actor = environment.start(256, behavior, seed)
-        named = {"env_name": environment.title, "behavior": behavior}
-        collect(simulator, env, actor, sessions, seed, logs, **named)
+        names = {"env_name": environment.title, "behavior": behavior}
+        collect(simulator, env, actor, sessions, seed, logs, **names)
     if not store.exists():
         items = logs / "items.parquet"
         # Collecting logs needs no DuckDB.

@@ -165,8 +165,8 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
     `episodes` (M,) are sorted indices, `items` (M,) the items of these steps; M is at least 1.
     """
     starts, means = np.unique(episodes, return_index=True)[1], []
-    for listed in np.split(items, starts[1:]):
-        first, second = (listed[places] for places in np.triu_indices(len(listed), 1))
+    for session_items in np.split(items, starts[1:]):
+        first, second = (session_items[places] for places in np.triu_indices(len(session_items), 1))
         shared = (incidence[first] & incidence[second]).sum(axis=1)
         either = (incidence[first] | incidence[second]).sum(axis=1)
         distances = np.where(first == second, 0.0, 1 - shared / np.maximum(either, 1))

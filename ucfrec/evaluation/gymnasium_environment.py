@@ -133,20 +133,17 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
         """Take one item or vector as action (A,)."""
-        played = self.env.step(self._to_action(action))
-        observation, reward, terminated, truncated, info = played
+        observation, reward, terminated, truncated, info = self.env.step(self._to_action(action))
         # Many environments give it once, at the start of the session.
         self._user = _user(info) or self._user
         return self._vector(observation), reward, terminated, truncated, self._user
 
     def _vector(self, observation: Any) -> Float32Array:
-        if not self._observed:
-            return np.zeros(0, dtype=np.float32)
         parts: list[Any] = [
             spaces.flatten(space, observation if key is None else observation[key])
             for key, space in self._observed
         ]
-        return np.concatenate(parts).astype(np.float32)
+        return np.concatenate([np.zeros(0), *parts]).astype(np.float32)
 
 
 def _make(env_id: str) -> gymnasium.Env[Any, Any]:

@@ -218,10 +218,10 @@ def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
 
 def _require_comparable(ids: pd.Series, reference: pd.Series, of_others: str) -> None:
     """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
-    own, other = _kind(ids), _kind(reference)
-    if own != other:
+    kind, theirs = _kind(ids), _kind(reference)
+    if kind != theirs:
         raise InputError(
-            f"{ids.name} holds {own} in recommended, but {other} in {of_others}; convert one of "
+            f"{ids.name} holds {kind} in recommended, but {theirs} in {of_others}; convert one of "
             "them with astype"
         )
 

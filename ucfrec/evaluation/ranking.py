@@ -5,11 +5,11 @@ sampled (Krichene & Rendle, KDD 2020). What counts as liked (a click) can be sai
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -133,15 +133,8 @@ class Steps:
     """Rows (M,) and items (M,) that may not be recommended; None to rank all items."""
 
 
-class Ranker(Protocol):
-    """Scores all items of the catalogue at every step."""
-
-    @property
-    def name(self) -> str:
-        """Name in result rows."""
-
-    def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items), higher is better; (1, n_items) if all steps have the same scores."""
+Ranker = Callable[[Steps], Tensor]
+"""Scores all items at B steps (B, n_items), higher is better; (1, n_items) if they are the same."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +157,7 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
     for begin in range(0, store.n_steps, at_once):
         numbers = np.arange(begin, min(begin + at_once, store.n_steps))
         batch = later.steps(numbers, later.filter_seen)
-        scores = ranker.scores(batch)
+        scores = ranker(batch)
         if batch.left_out is not None:
             scores = scores.expand(len(numbers), n_items).clone()
             scores[batch.left_out] = -torch.inf
@@ -183,7 +176,7 @@ def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
     result = np.empty(len(owner))
     for begin in range(0, len(first), at_once):
         at = first[begin : begin + at_once]
-        scores = ranker.scores(later.steps(at, filter_seen=False))
+        scores = ranker(later.steps(at, filter_seen=False))
         rows = order[bounds[begin] : bounds[begin + len(at)]]
         of_user = (owner[rows] - begin) % len(scores)
         result[rows] = scores.double().numpy()[of_user, items[rows]]
@@ -309,12 +302,12 @@ def _find_ends(resampled: Float64Array) -> Float64Array:
         return np.nanquantile(resampled, [0.025, 0.975], axis=0)
 
 
-def name_rankers(rankers: Sequence[Ranker]) -> dict[str, Ranker]:
+def name_rankers(rankers: Iterable[tuple[str, Ranker]]) -> dict[str, Ranker]:
     """The rankers by name; of equal names, the second and later ones get a suffix -2, -3, …"""
     by_name: dict[str, Ranker] = {}
-    for ranker in rankers:
-        name, number = ranker.name, 2
+    for title, ranker in rankers:
+        name, number = title, 2
         while name in by_name:
-            name, number = f"{ranker.name}-{number}", number + 1
+            name, number = f"{title}-{number}", number + 1
         by_name[name] = ranker
     return by_name

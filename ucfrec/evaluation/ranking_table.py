@@ -2,8 +2,8 @@
 training rows, on the same later steps."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -72,36 +72,27 @@ class PolicyRanker:
         return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
 
-@dataclass(frozen=True)
-class NamedRanker:
-    """Ranks items by a function of the steps; see `Ranker`."""
-
-    name: str
-    scores: Callable[[Steps], Tensor]
-
-
-def same_for_all(name: str, items: Tensor) -> NamedRanker:
+def same_for_all(items: Tensor) -> Ranker:
     """Ranks items by fixed scores (n_items,), the same for all users."""
-    return NamedRanker(name, lambda _: items.unsqueeze(0))
+    return lambda _: items.unsqueeze(0)
 
 
-def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> NamedRanker:
+def neighbour_ranker(train: EpisodeStore, tie_break: Tensor) -> Ranker:
     """Ranks items by their cosine to the user's latest rewarded items, of all sessions, also before
     the log; ties go to the popular ones. See `ItemKNNPolicy`."""
     knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
     knn.start_from(train)
-    tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(steps: Steps) -> Tensor:
         items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
         return knn.similarity(items, rewards) + tie_break
 
-    return NamedRanker("item-knn", scores)
+    return scores
 
 
 def factor_rankers(
-    train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
-) -> Iterator[NamedRanker]:
+    train: EpisodeStore, tie_break: Tensor, seed: int, liked_of: LikedOf
+) -> Iterator[tuple[str, Ranker]]:
     """Rank items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
     and BPR (Rendle et al., 2009); needs the package `implicit`."""
     from implicit.als import AlternatingLeastSquares
@@ -112,10 +103,9 @@ def factor_rankers(
     users = owners[train.all_steps()[0]]
     items = train.column(schema.ITEM)
     liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
-    shape = (int(users.max()) + 1, len(popularity))
+    shape = (int(users.max()) + 1, len(tie_break))
     matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
     matrix.eliminate_zeros()
-    tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(of_users: Tensor, of_items: Tensor, steps: Steps) -> Tensor:
         rows = np.where(steps.users < len(of_users) - 1, steps.users, -1)
@@ -130,7 +120,7 @@ def factor_rankers(
         factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
         of_users = torch.from_numpy(factors.astype(np.float32))
         of_items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
-        yield NamedRanker(name, partial(scores, of_users, of_items))
+        yield name, partial(scores, of_users, of_items)
 
 
 def baselines(
@@ -139,8 +129,8 @@ def baselines(
     seed: int,
     liked_of: LikedOf = liked_rewards,
     store: EpisodeStore | None = None,
-) -> list[Ranker]:
-    """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
+) -> dict[str, Ranker]:
+    """Baselines by name: random, most shown, most clicked, item click rate, item-kNN, boosted
     clicks, ALS and BPR if the package `implicit` is installed (extra `rank`), and clicks and click
     rate with half-lives, which the validation split of `store` chooses.
 
@@ -150,17 +140,15 @@ def baselines(
     """
     impressions, liked = counts.shown.double(), counts.liked.double()
     generator = torch.Generator().manual_seed(seed)
-    rankers: list[Ranker] = [
-        NamedRanker(
-            "random",
-            lambda steps: torch.rand(len(steps.steps), len(impressions), generator=generator),
-        ),
-        same_for_all("most shown", impressions),
-        same_for_all("most clicked", liked),
-        same_for_all("item click rate", shrink_rates(counts)),
-    ]
+    rankers: dict[str, Ranker] = {
+        "random": lambda steps: torch.rand(len(steps.steps), len(impressions), generator=generator),
+        "most shown": same_for_all(impressions),
+        "most clicked": same_for_all(liked),
+        "item click rate": same_for_all(shrink_rates(counts)),
+    }
     if train is not None:
-        rankers.append(neighbour_ranker(train, impressions.float()))
+        tie_break = 1e-6 * impressions.float() / impressions.float().max()
+        rankers["item-knn"] = neighbour_ranker(train, tie_break)
         config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
         boosted = BoostedPolicy(config, policy_sizes(train))
         boosted.start_from(train)
@@ -170,15 +158,15 @@ def baselines(
             windows = steps.store.windows(steps.episodes, steps.steps, _KNN_HISTORY + 1)
             return boosted.act(windows)
 
-        rankers.append(NamedRanker("boosted clicks", scores))
+        rankers["boosted clicks"] = scores
         if find_spec("implicit") is not None:
-            rankers += factor_rankers(train, impressions.float(), seed, liked_of)
+            rankers |= factor_rankers(train, tie_break, seed, liked_of)
     if train is not None and store is not None and store.split("validation").n_episodes:
         first, validation = store.split("train"), store.split("validation")
         for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
             hours = kind.best_half_life(first, validation, liked_of)
             recent = kind.scores_of(TrainingCounts.of(train, liked_of, hours))
-            rankers.append(same_for_all(f"recent {name}", recent.double()))
+            rankers[f"recent {name}"] = same_for_all(recent.double())
     return rankers
 
 
@@ -223,7 +211,7 @@ def ranking_rows(
         fitted_on = train.split("train")
     if liked is not None and fitted_on is not None:
         counts = TrainingCounts.of(fitted_on, liked)
-    unnamed: list[Ranker] = [*policies]
+    unnamed: list[tuple[str, Ranker]] = [(policy.name, policy.scores) for policy in policies]
     if trained.reward_model is not None:
         scorer = trained.scorer()
 
@@ -231,8 +219,8 @@ def ranking_rows(
             sessions = sessions_before(scorer, steps.store, steps.episodes, steps.steps)
             return scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
 
-        unnamed.append(NamedRanker("reward model", scores))
-    unnamed += baselines(counts, fitted_on, seed, liked_of, train)
+        unnamed.append(("reward model", scores))
+    unnamed += baselines(counts, fitted_on, seed, liked_of, train).items()
     rankers = name_rankers(unnamed)
     k = min(k, len(counts.shown))
     period = Period.of(later.store, np.asarray(users), liked_of)

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
+import pandas as pd
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float64Array
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors
@@ -163,24 +162,18 @@ def compare_arms(
     files = log_files(paths)
     name = first_and_more(files)
     groups = _sum_by_user(files, column, memory_limit)
-    has_user, has_arm = groups["who"].astype(bool), groups[schema.ARM] != ""
+    has_user, has_arm = groups["who"], groups[schema.ARM] != ""
     if beyond := int(groups["beyond"].sum()):
         raise InputError(
             f"{name}: {column} is infinite or beyond ±{_LARGEST:g} in {beyond:,} rows; correct the "
             "values, or remove them to leave the rows out"
         )
     counts = has_user & has_arm & (groups["arms"] == 1)
-    sums: dict[str, Float64Array] = {}
-    without_value, in_arm = dict[str, int](), dict[str, int]()
-    for arm in map(str, np.unique(groups[schema.ARM][counts])):
-        inside = counts & (groups[schema.ARM] == arm)
-        values, with_value, rows = (groups[part][inside] for part in ("value", "shown", "rows"))
-        sums[arm] = np.stack([values, with_value.astype(np.float64)])[:, with_value > 0]
-        without_value[arm], in_arm[arm] = int((rows - with_value).sum()), len(rows)
-    users = {arm: values.shape[1] for arm, values in sums.items()}
-    names = arms or sorted(users, key=lambda arm: -users[arm])
-    if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
-        present = ", ".join(f"{arm!r} ({count:,} users)" for arm, count in sorted(users.items()))
+    by_arm = {str(arm): rows for arm, rows in groups[counts].groupby(schema.ARM)}
+    valued = {arm: rows[rows["shown"] > 0] for arm, rows in by_arm.items()}
+    names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
+    if len(names) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
+        present = ", ".join(f"{arm!r} ({len(rows):,} users)" for arm, rows in valued.items())
         raise InputError(
             f"{name}: two arms with two users each who have a value of {column} are needed, the "
             f"logs have {present or 'none'}; write exposures with serve --split, or name two with "
@@ -190,19 +183,23 @@ def compare_arms(
     if shares is not None and not {first, second} <= shares.keys():
         raise InputError(f"{name}: shares are given of {', '.join(shares)}; the arms are {names}")
     of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
-    if without_value[first] or without_value[second]:
+    all_a, all_b, of_a, of_b = by_arm[first], by_arm[second], valued[first], valued[second]
+    rows = int(of_a["shown"].sum()), int(of_b["shown"].sum())
+    without_value = int(all_a["rows"].sum()) - rows[0], int(all_b["rows"].sum()) - rows[1]
+    if any(without_value):
         text = (
-            f"{name}: {column} has no value in {without_value[first]:,} rows of {first} and "
-            f"{without_value[second]:,} of {second}, which are left out; write 0 where it is meant"
+            f"{name}: {column} has no value in {without_value[0]:,} rows of {first} and "
+            f"{without_value[1]:,} of {second}, which are left out; write 0 where it is meant"
         )
         warnings.warn(text, InputNote, stacklevel=2)
     (value_a, error_a), (value_b, error_b) = (
-        cluster_mean(total / count, None, count) for total, count in (sums[first], sums[second])
+        cluster_mean((part["value"] / count).to_numpy(), None, count)
+        for part, count in ((of_a, of_a["shown"].to_numpy()), (of_b, of_b["shown"].to_numpy()))
     )
     difference, variance = value_b - value_a, error_b**2 + error_a**2
     error = math.sqrt(variance)
     low = high = always_low = always_high = None
-    if min(error_a, error_b) > 0 and min(users[first], users[second]) >= FEWEST_USERS:
+    if min(error_a, error_b) > 0 and min(len(of_a), len(of_b)) >= FEWEST_USERS:
         mixture = expected or EXPECTED * abs(value_a) or error
         low, high = difference - _NORMAL * error, difference + _NORMAL * error
         always_low, always_high = always_valid(difference, variance, mixture)
@@ -210,11 +207,11 @@ def compare_arms(
         column=column,
         arms=(first, second),
         values=(value_a, value_b),
-        users=(users[first], users[second]),
-        in_arm=(in_arm[first], in_arm[second]),
+        users=(len(of_a), len(of_b)),
+        in_arm=(len(all_a), len(all_b)),
         shares=(of_first / (of_first + of_second), of_second / (of_first + of_second)),
-        rows=(int(sums[first][1].sum()), int(sums[second][1].sum())),
-        without_value=(without_value[first], without_value[second]),
+        rows=rows,
+        without_value=without_value,
         without_user=int(groups["rows"][~has_user].sum()),
         without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
         in_several=int((has_user & (groups["arms"] > 1) & groups["last"]).sum()),
@@ -227,7 +224,7 @@ def compare_arms(
     )
 
 
-def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[str, Array]:
+def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> pd.DataFrame:
     """Sum of the values, numbers of values and rows of each user in each arm; "" for no arm."""
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
@@ -252,7 +249,7 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
             for table in tables
         )
         with explain_errors(connection, tables):
-            groups: dict[str, Any] = connection.execute(
+            return connection.execute(
                 "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM ("
                 "SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
@@ -260,5 +257,4 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
                 "count(arm) OVER (PARTITION BY who) AS arms, "
                 "coalesce(arm = max(arm) OVER (PARTITION BY who), false) AS last "
                 f"FROM ({rows}) GROUP BY who, arm) AS groups ORDER BY groups.arm, groups.who"
-            ).fetchnumpy()
-    return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}
+            ).df()

@@ -46,7 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.logged_steps import LoggedSteps, number_clusters
 from ucfrec.results.statistics import effective_number
 
 SUITE: Final = "off-policy"
@@ -253,14 +253,14 @@ class StepSums:
         rewarded = np.bincount(steps.step, steps.weights * left).astype(np.float64)
         return cls(len(steps.first), steps.step_totals(), rewarded)
 
-    def __add__(self, other: "StepSums") -> "StepSums":
-        totals, rewarded = np.zeros((2, max(len(self.totals), len(other.totals))))
-        for sums in (self, other):
+    def __add__(self, more: "StepSums") -> "StepSums":
+        totals, rewarded = np.zeros((2, max(len(self.totals), len(more.totals))))
+        for sums in (self, more):
             # Sessions that have ended keep the weight of their last step, and have no reward.
             padding = 0, len(totals) - len(sums.totals)
             totals += np.pad(sums.totals, padding, "edge")
             rewarded += np.pad(sums.rewarded, padding)
-        return StepSums(self.sessions + other.sessions, totals, rewarded)
+        return StepSums(self.sessions + more.sessions, totals, rewarded)
 
 
 def normalise_by_step(
@@ -301,7 +301,7 @@ MOST_CLUSTERS = 10_000
 """Of more, random groups are drawn: the error stays, and time and memory are bounded."""
 FEWEST_USERS = 10
 """Users below which their spread says too little for a conclusion."""
-_COUNTS_AT_ONCE = 2**22
+_CLUSTERS_AT_ONCE = 2**10
 _USABLE = 0.9
 """Share of resamples that must have a spread of their own."""
 
@@ -370,7 +370,8 @@ def resample(
     above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
 ) -> Resamples:
     """Draw clusters with replacement, each with all its sessions: `cluster_intervals`."""
-    names, clusters = _number_clusters(cluster, len(above))
+    names = number_clusters(cluster, len(above))
+    clusters = int(names.max()) + 1
     if clusters > MOST_CLUSTERS:
         shuffled = np.random.default_rng(seed).permutation(clusters)
         names, clusters = shuffled[names] % MOST_CLUSTERS, MOST_CLUSTERS
@@ -381,51 +382,36 @@ def resample(
         for values in (above, below)
     )
     value = above.sum(axis=0) / below.sum(axis=0)
-    # Deviations from the estimate, in units that keep squares of large weights finite.
-    scale = np.maximum(np.abs(above - value * below).max(axis=0), np.finfo(float).tiny)
+    # In units that keep squares of large weights finite.
     size = np.abs(below).max(axis=0)
-    e, b = (above - value * below) / scale, below / size
-    unit = scale / size
+    e, b = (above - value * below) / size, below / size
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
     moments = np.concatenate([e, b, e * e, e * b, b * b], axis=1)
-    counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
-    shifts, spreads = [], []
-    for begin in range(0, RESAMPLES, at_once):
-        # How often each cluster is drawn stands for the resampled rows.
-        times = counts[begin : begin + at_once].astype(np.float64)
-        e, b, ee, eb, bb = (times @ moments).reshape(-1, 5, len(value)).swapaxes(0, 1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            shift = np.where(b > 0, e / b, np.nan)
-            spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
-            spreads.append(correction * np.sqrt(spread) / b * unit)
-        shifts.append(shift * unit)
-    shift, errors, error_in_units = np.concatenate(shifts), np.concatenate(spreads), error * unit
-    differ = (error > 1e-12) & (clusters > 1)
-    usable = differ & np.isfinite(shift) & (errors > 1e-9 * error_in_units)
+    # How often each cluster is drawn stands for the resampled rows; as floats, some at a time.
+    counts = np.array_split(_draw_counts(clusters, seed), max(1, clusters // _CLUSTERS_AT_ONCE))
+    sums = np.concatenate([times.astype(np.float64) @ moments for times in counts])
+    e, b, ee, eb, bb = sums.reshape(-1, 5, len(value)).swapaxes(0, 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = np.where(b > 0, e / b, np.nan)
+        spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
+        errors = correction * np.sqrt(spread) / b
+    usable = (clusters > 1) & np.isfinite(shift) & (errors > 1e-9 * error)
     studentised = np.full(shift.shape, np.nan)
     studentised[usable] = shift[usable] / errors[usable]
-    return Resamples(value, error_in_units, shift, studentised)
+    return Resamples(value, error, shift, studentised)
 
 
 def cluster_mean(
     values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
 ) -> tuple[float, float]:
     """Mean of values (S,), of weights (S,) if given, and its standard error over clusters (S,)."""
-    names, clusters = _number_clusters(cluster, len(values))
-    above = np.bincount(names, values if weights is None else values * weights, clusters)
-    below = np.bincount(names, weights, clusters)
+    names = number_clusters(cluster, len(values))
+    above = np.bincount(names, values if weights is None else values * weights)
+    below, clusters = np.bincount(names, weights), len(above)
     mean = above.sum() / below.sum()
     spread = np.square(above - mean * below).sum()
     return float(mean), float(np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum())
-
-
-def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
-    """(S,) clusters numbered from 0, and how many there are."""
-    if cluster is None:
-        return np.arange(sessions), sessions
-    names = np.unique(cluster, return_inverse=True)[1]
-    return names, int(names.max()) + 1
 
 
 @lru_cache(maxsize=1)
@@ -433,12 +419,7 @@ def _draw_counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
     """(B, C) how often each resample has each cluster, at most 40 MB; kept for the next call."""
     generator = np.random.default_rng(seed)
     counts = np.empty((RESAMPLES, clusters), dtype=np.uint16)
-    at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))
-    for begin in range(0, RESAMPLES, at_once):
-        draws = min(at_once, RESAMPLES - begin)
-        picked = generator.integers(clusters, size=(draws, clusters))
-        picked += np.arange(draws)[:, None] * clusters
-        times = np.bincount(picked.ravel(), minlength=draws * clusters)
-        counts[begin : begin + draws] = times.reshape(draws, clusters)
+    for times in counts:
+        times[:] = np.bincount(generator.integers(clusters, size=clusters), minlength=clusters)
     counts.setflags(write=False)
     return counts

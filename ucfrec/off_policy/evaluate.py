@@ -208,8 +208,9 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **{f"model_{name}": value for name, value in asdict(models).items()},
     }
-    evidence = Evidence(steps, len(steps.reward), columns, declared=declared, models=models)
-    evidence.fingerprint = store.record.fingerprint
+    evidence = Evidence(
+        steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
+    )
     _doubt_logs(evidence, logged, options.pages)
     items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
@@ -268,7 +269,7 @@ def make_report(
         filter_seen=options.filter_seen,
     )
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
-    judged = evidence.columns | asdict(verdict) | diagnosis.as_columns()
+    judged = evidence.columns | asdict(verdict) | diagnosis.list_columns()
     judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
     del judged["estimator"], judged["reasons"]
     record, of_steps = trained.record, {} if per_step is None else per_step.estimates
@@ -430,13 +431,13 @@ def collect_steps(
     declared, unknown = "", int(np.isnan(propensity).sum())
     if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
         group = np.maximum(groups.number, 0)
-        behavior = fit_behavior(inputs.states, items, group, plain.session, seed, plain.user)
+        owner = plain.users[plain.session]
+        behavior = fit_behavior(inputs.states, items, group, owner, seed)
         of_group = np.take_along_axis(groups.target, group[:, None], axis=1)[:, 0]
         columns["cluster_propensity"] = behavior.group
         columns["cluster_target"] = np.where(groups.number < 0, 0.0, of_group).clip(0, 1)
         if options.estimate_propensities and unknown:
             declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
             columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
-    reward, session = plain.reward, plain.session
-    modelled, models = fit_models(inputs.chunks, reward, session, seed, plain.user, plain.discount)
+    modelled, models = fit_models(inputs.chunks, plain, seed)
     return replace(plain, target=target, model=modelled, groups=groups, **columns), models, declared

@@ -120,10 +120,10 @@ class LoggedSteps:
             replace_field("user", _number_users(self.user))
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
             raise InputError("give both cluster_propensity and cluster_target, or neither")
-        columns = {name: getattr(self, name) for name in _COLUMNS}
+        columns = [(name, getattr(self, name)) for name in _COLUMNS]
         for part in (self.model, self.groups):
-            columns |= {} if part is None else vars(part)
-        for name, values in columns.items():
+            columns += vars(part).items() if part else ()
+        for name, values in columns:
             if values is not None and len(values) != n:
                 raise InputError(f"{name} has {len(values):,} values for {n:,} steps")
         if self.user is not None and len(self.user) != len(self.first):
@@ -139,9 +139,7 @@ class LoggedSteps:
     @cached_property
     def users(self) -> IntArray:
         """(S,) users numbered from 0; each session is one where users are unknown."""
-        if self.user is None:
-            return np.arange(len(self.first))
-        return np.unique(self.user, return_inverse=True)[1]
+        return number_clusters(self.user, len(self.first))
 
     @cached_property
     def lacking(self) -> BoolArray:
@@ -162,6 +160,12 @@ class LoggedSteps:
     def step(self) -> IntArray:
         """(N,) place of each step in its session, from 0."""
         return np.arange(len(self.session)) - self.first[self.session]
+
+    @cached_property
+    def rows_by_place(self) -> list[IntArray]:
+        """The steps at every place in a session, sessions in order."""
+        order = np.argsort(self.step, kind="stable")
+        return np.split(order, np.cumsum(np.bincount(self.step))[:-1])
 
     @cached_property
     def discounts(self) -> Float64Array:
@@ -231,12 +235,14 @@ class LoggedSteps:
     def _multiply(self, ratios: Float64Array) -> Float64Array:
         """(N,) products of ratios (N,) from the session's first step to each, in place."""
         # One pass a place in the session: sums of logarithms would lose digits over many sessions.
-        longest_first = np.argsort(-self.lengths, kind="stable")
-        starts, lengths = self.first[longest_first], self.lengths[longest_first]
-        for place in range(1, int(lengths[0])):
-            at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
-            ratios[at] = np.minimum(ratios[at] * ratios[at - 1], _LARGEST)
+        for rows in self.rows_by_place[1:]:
+            ratios[rows] = np.minimum(ratios[rows] * ratios[rows - 1], _LARGEST)
         return np.minimum(ratios, _LARGEST)
+
+
+def number_clusters(cluster: IntArray | None, sessions: int) -> IntArray:
+    """(S,) clusters numbered from 0; each session is one where they are unknown."""
+    return np.arange(sessions) if cluster is None else np.unique(cluster, return_inverse=True)[1]
 
 
 def _convert_to_floats(name: str, values: Any) -> Float64Array:

@@ -13,7 +13,7 @@ from scipy.special import softmax
 from torch import Tensor
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.off_policy.logged_steps import Modelled
+from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.score import ScoredSteps
 from ucfrec.processes import progress, require_blas_memory
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -35,7 +35,7 @@ class StepInputs:
     """(B, 1 + F): the return left of the target, and last-layer features of the window, if any."""
     chosen: Tensor
     """(B, D) embedding of the logged item; zeros for an item that the run does not know."""
-    shown: Tensor
+    expected: Tensor
     """(B, D) mean embedding over the items that the evaluated policy shows."""
     scores: Tensor
     """(B, 2) log-probability of the logged item, and its mean over the items that the evaluated
@@ -45,7 +45,7 @@ class StepInputs:
         """Features (B, P) of state and logged item, and their mean over the evaluated policy's."""
         return (
             self._cross(self.chosen, self.scores[:, [0]]),
-            self._cross(self.shown, self.scores[:, [1]]),
+            self._cross(self.expected, self.scores[:, [1]]),
         )
 
     def _cross(self, items: Tensor, score: Tensor) -> Float32Array:
@@ -82,7 +82,7 @@ def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tens
         states=batch.states.float(),
         window=window,
         chosen=embeddings[batch.items] * in_catalogue[:, None],
-        shown=probabilities @ embeddings,
+        expected=probabilities @ embeddings,
         scores=torch.stack([score, mean_score], dim=1),
     )
     return target.clamp(0, 1).numpy(), probabilities, inputs
@@ -92,47 +92,44 @@ class InputsFile:
     """Inputs of N steps in a file without a name: some hundred numbers a step, none in memory."""
 
     def __init__(self, steps: int) -> None:
-        self._rows = array_on_disk((steps, 0))
-        self._end, self._sizes = 0, [0]
+        self._steps, self._end = steps, 0
 
     def append(self, inputs: StepInputs) -> None:
         """Write the next steps."""
         parts: list[Tensor] = [*vars(inputs).values()]
         if not self._end:
             self._sizes = [part.shape[1] for part in parts]
-            self._rows = array_on_disk((len(self._rows), sum(self._sizes)))
+            self._rows = array_on_disk((self._steps, sum(self._sizes)))
         begin, self._end = self._end, self._end + len(parts[0])
         self._rows[begin : self._end] = torch.cat(parts, dim=1).numpy()
 
     def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
         """All steps in order, some thousand at once, as `StepInputs.features`."""
-        return (inputs.features() for inputs in self._read())
+        for part in _split_rows(self._rows):
+            rows = torch.from_numpy(np.array(self._rows[part]))
+            yield StepInputs(*torch.split(rows, self._sizes, dim=1)).features()
 
-    def states(self) -> Iterator[Float32Array]:
-        """(B, S) states of all steps in order, some thousand at once."""
-        return (np.asarray(inputs.states) for inputs in self._read())
+    @property
+    def states(self) -> Float32Array:
+        """(N, S), still on disk."""
+        return np.asarray(self._rows[:, : self._sizes[0]])
 
-    def _read(self) -> Iterator[StepInputs]:
-        at_once = max(1, min(ROWS_AT_ONCE, _NUMBERS_AT_ONCE // self._rows.shape[1]))
-        for begin in range(0, len(self._rows), at_once):
-            rows = torch.from_numpy(np.array(self._rows[begin : begin + at_once]))
-            yield StepInputs(*torch.split(rows, self._sizes, dim=1))
+
+def _split_rows(rows: Float32Array) -> Iterator[slice]:
+    """Slices of rows that may be in memory together."""
+    at_once = max(1, min(ROWS_AT_ONCE, _NUMBERS_AT_ONCE // rows.shape[1]))
+    return (slice(begin, begin + at_once) for begin in range(0, len(rows), at_once))
 
 
 def array_on_disk(shape: tuple[int, int]) -> Float32Array:
     """Zeros whose memory the system can take back, writing them to a file without a name; OSError
     if the disk of the system's temporary folder is full."""
-    if 0 in shape:
-        return np.zeros(shape, dtype=np.float32)
     with tempfile.TemporaryFile(prefix="ucfrec-") as file:
         if hasattr(os, "posix_fallocate"):  # not on macOS
             # A full disk is an error now; later it would be the end of the process.
             os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
         return np.memmap(file, np.float32, "r+", shape=shape)
 
-
-States = Callable[[], Iterator[Float32Array]]
-"""Reads the states (N, S) from the first step on, some thousand at once."""
 
 _BEHAVIOR_FOLDS: Final = 3
 _MOST_ROWS = 20_000
@@ -182,52 +179,42 @@ class BehaviorModel:
 
 
 def fit_behavior(
-    states: States,
-    item: IntArray,
-    group: IntArray,
-    session: IntArray,
-    seed: int,
-    user: IntArray | None = None,
+    states: Float32Array, item: IntArray, group: IntArray, owner: IntArray, seed: int
 ) -> BehaviorModel:
     """Estimate the probabilities with which the logged items (N,) and their groups (N,), from 0,
-    were chosen; `session` and `user` as of `LoggedSteps`. Item −1, unknown, gets probability 1 and
-    is fitted on nowhere.
+    were chosen in states (N, S), of which some thousand are read at once; `owner` (N,) is the user,
+    from 0. Item −1, unknown, gets probability 1 and is fitted on nowhere.
     """
     rng = np.random.default_rng(seed)
-    owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
     folds = rng.permutation(int(owner.max()) + 1)[owner] % _BEHAVIOR_FOLDS
     in_catalogue, count = item >= 0, int(group.max()) + 1
-    samples = []
-    for fold in range(_BEHAVIOR_FOLDS):
-        rows = np.flatnonzero(in_catalogue & (folds != fold))
-        if len(rows) > _MOST_ROWS:
-            rows = np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
-        samples.append(rows)
-    sample = np.unique(np.concatenate(samples))
-    look_up = _look_up_states(states, sample)
-    models = []
+    models, samples = [], []
     with progress(_BEHAVIOR_FOLDS, "propensities", "folds") as bar:
-        for fold, rows in enumerate(samples):
-            shares = np.bincount(group[in_catalogue & (folds != fold)], minlength=count) + 1.0
-            models.append(_GroupModel(look_up(rows), group[rows], shares / shares.sum()))
+        for fold in range(_BEHAVIOR_FOLDS):
+            rows = np.flatnonzero(in_catalogue & (folds != fold))
+            shares = np.bincount(group[rows], minlength=count) + 1.0
+            if len(rows) > _MOST_ROWS:
+                rows = np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
+            samples.append(rows)
+            models.append(_GroupModel(states[rows], group[rows], shares / shares.sum()))
             bar.update()
-    calibration = _calibrate(models, look_up, group, folds, sample)
-    of_group, begin = np.ones(len(item)), 0
+    sample = np.unique(np.concatenate(samples))
+    temperature, share = _calibrate(models, states, group, folds, sample)
+    of_group = np.ones(len(item))
     # By group and tenth of the probability: what is expected, less what occurs.
     table = np.zeros((count, 10))
-    for batch in states():
-        part = slice(begin, begin + len(batch))
+    for part in _split_rows(states):
+        batch = states[part]
         probabilities = np.empty((len(batch), count))
         for fold, model in enumerate(models):
             rows = folds[part] == fold
-            probabilities[rows] = model.predict(batch[rows], *calibration)
+            probabilities[rows] = model.predict(batch[rows], temperature, share)
         of_group[part] = np.take_along_axis(probabilities, group[part][:, None], axis=1)[:, 0]
         rows = np.flatnonzero(in_catalogue[part])
         beyond = probabilities[rows]
         tenth = np.minimum((beyond * 10).astype(np.int64), 9)
         beyond[np.arange(len(rows)), group[part][rows]] -= 1
         np.add.at(table, (np.arange(count), tenth), beyond)
-        begin = part.stop
     shares = np.stack([model.shares for model in models])[folds, group]
     return BehaviorModel(
         group=np.where(in_catalogue, of_group, 1.0),
@@ -244,48 +231,29 @@ class _GroupModel:
     def __init__(self, states: Float32Array, group: IntArray, shares: Float64Array) -> None:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
 
         self.shares, self._present, self._model = shares, np.unique(group), None
         # There may be no row at all, where all other users were shown unknown items.
         if len(self._present) > 1:
-            self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
-            self._spread[self._spread == 0] = 1.0
             require_blas_memory()
             model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
-            self._model = model.fit(self._scale(states), group)
+            self._model = make_pipeline(StandardScaler(), model).fit(states, group)
 
     def predict(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
-        scores = self._model.decision_function(self._scale(states)) / temperature
-        if scores.ndim == 1:
-            scores = np.stack([-scores / 2, scores / 2], axis=1)
+        scores = self._model.predict_log_proba(states) / temperature
         probabilities = np.zeros((len(states), len(self.shares)))
         probabilities[:, self._present] = softmax(scores, axis=1)
         return (1 - share) * probabilities + share * self.shares
 
-    def _scale(self, states: Float32Array) -> Float32Array:
-        scaled = np.asarray(states - self._mean, dtype=np.float32)
-        scaled /= self._spread
-        return scaled
-
-
-def _look_up_states(states: States, rows: IntArray) -> Callable[[IntArray], Float32Array]:
-    """Looks up the states of numbered steps, all among `rows` (sorted)."""
-    table, begin = array_on_disk((0, 0)), 0
-    for batch in states():
-        if not begin:
-            table = array_on_disk((len(rows), batch.shape[1]))
-        low, high = np.searchsorted(rows, [begin, begin + len(batch)])
-        table[low:high] = batch[rows[low:high] - begin]
-        begin += len(batch)
-    return lambda some: np.asarray(table[np.searchsorted(rows, some)])
-
 
 def _calibrate(
     models: list[_GroupModel],
-    look_up: Callable[[IntArray], Float32Array],
+    states: Float32Array,
     group: IntArray,
     folds: IntArray,
     sample: IntArray,
@@ -295,10 +263,10 @@ def _calibrate(
     losses = np.zeros((len(_TEMPERATURES), len(_SHARES)))
     for fold, model in enumerate(models):
         mine = sample[folds[sample] == fold][:_MOST_ROWS]
-        states, rows = look_up(mine), np.arange(len(mine))
+        rows = np.arange(len(mine))
         shares = model.shares[group[mine]]
         for loss, temperature in zip(losses, _TEMPERATURES, strict=True):
-            likely = model.predict(states, temperature, 0.0)[rows, group[mine]]
+            likely = model.predict(states[mine], temperature, 0.0)[rows, group[mine]]
             loss -= np.log((1 - mixed_in) * likely + mixed_in * shares).sum(axis=1)
     best, share = np.unravel_index(losses.argmin(), losses.shape)
     return _TEMPERATURES[best], _SHARES[share]
@@ -351,44 +319,33 @@ class ModelReport:
         )
 
 
-def fit_models(
-    chunks: Chunks,
-    reward: Float64Array,
-    session: IntArray,
-    seed: int,
-    user: IntArray | None = None,
-    discount: float = 1.0,
-) -> tuple[Modelled, ModelReport]:
+def fit_models(chunks: Chunks, steps: LoggedSteps, seed: int) -> tuple[Modelled, ModelReport]:
     """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
     by a model that saw it, nor by one that saw another session of its user. What they say of the N
-    steps, and how good they are; arguments as of `LoggedSteps`.
+    steps, and how good they are.
     """
-    sessions = np.arange(int(session[-1]) + 1)
-    group = sessions if user is None else np.unique(user, return_inverse=True)[1]
-    users = int(group.max()) + 1
+    reward, users = steps.reward, int(steps.users.max()) + 1
     fold_of = np.random.default_rng(seed).permutation(users) % min(_RETURN_FOLDS, users)
-    folds = fold_of[group][session]
-    last = np.diff(session, append=len(sessions)) > 0
-    horizon = int(np.diff(np.flatnonzero(last), prepend=-1).max())
+    folds = fold_of[steps.users][steps.session]
+    last, horizon = np.zeros(len(reward), dtype=bool), int(steps.lengths.max())
+    last[steps.last] = True
     with progress(2 * len(reward), "models", "steps") as bar:
         sums = _add_up(chunks, reward, folds, last, bar.update)
         fits = [
-            _fit_to_others(sums, fold, reward[folds != fold], horizon, discount)
+            _fit_to_others(sums, fold, reward[folds != fold], horizon, steps.discount)
             for fold in range(len(sums.rows))
         ]
         weights = np.stack([models for models, _, _ in fits], axis=2)
-        predictions, begin = np.empty((2, 2, len(reward))), 0
+        predictions, begin = [], 0
         for batch in chunks():
-            fold = folds[begin : begin + len(batch[0]), None]
-            for both, inputs in zip(predictions, batch, strict=True):
-                for predicted, model in zip(both, weights, strict=True):
-                    values = np.take_along_axis(inputs @ model, fold, axis=1)
-                    predicted[begin : begin + len(fold)] = values[:, 0]
-            begin += len(fold)
-            bar.update(len(fold))
-    (logged_reward, q), (mean_reward, v) = predictions
+            rows = np.arange(len(batch[0]))
+            fold = folds[begin + rows]
+            predictions.append([(inputs @ weights)[:, rows, fold] for inputs in batch])
+            begin += len(rows)
+            bar.update(len(rows))
+    (logged_reward, q), (mean_reward, v) = np.concatenate(predictions, axis=2)
     modelled = Modelled(mean_reward, q, v, logged_reward)
-    errors = reward + discount * np.where(last, 0.0, np.roll(v, -1)) - q
+    errors = reward + steps.discount * np.where(last, 0.0, np.roll(v, -1)) - q
     variance = float(((reward - reward.mean()) ** 2).mean())
     left = float(((reward - logged_reward) ** 2).mean())
     return modelled, ModelReport(

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
@@ -197,7 +198,7 @@ def score_steps(
             numbers = np.arange(begin, min(begin + at_once, total))
             episodes, steps = store.locate(numbers)
             sessions = sessions_before(scorer, store, episodes, steps)
-            shown = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
+            earlier = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
             windows = scorer.windows(sessions)
             query = scorer.query(sessions, windows)
             excluded = None
@@ -208,7 +209,7 @@ def score_steps(
                 # A step that would have no item left excludes none.
                 left = np.bincount(rows, minlength=len(numbers))[rows] < n_items
                 excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
-            scores = scorer.scores_of(query, excluded, shown)
+            scores = scorer.scores_of(query, excluded, earlier)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
                 episodes,
@@ -240,23 +241,20 @@ def score(
     store, item_ids = logged.store, trained.items.ids
     for batch in score_steps(trained, store, rule, logged.rows if filter_seen else None):
         column = batch.items.unsqueeze(1)
-        values: dict[str, Any] = {
-            name: store.step_values(name, batch.episodes, batch.steps)
-            for name in (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY)
-            if name in store.record.columns
-        }
+        take = partial(store.step_values, episodes=batch.episodes, steps=batch.steps)
         probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
         better = batch.scores > batch.scores.gather(1, column)
         columns = {
             schema.USER_ID: logged.users[batch.episodes],
             SESSION: batch.episodes,
-            schema.TIMESTAMP: values.pop(schema.TIMESTAMP),
+            schema.TIMESTAMP: take(schema.TIMESTAMP),
             schema.ITEM_ID: item_ids[batch.items.numpy()],
-            **values,
-            PROBABILITY: probability.numpy(),
-            RANK: 1 + better.sum(1).numpy(),
-            GREEDY: item_ids[batch.scores.argmax(1).numpy()],
+            schema.REWARD: take(schema.REWARD),
         }
+        if schema.PROPENSITY in store.record.columns:
+            columns[schema.PROPENSITY] = take(schema.PROPENSITY)
+        columns[PROBABILITY], columns[RANK] = probability.numpy(), 1 + better.sum(1).numpy()
+        columns[GREEDY] = item_ids[batch.scores.argmax(1).numpy()]
         yield pd.DataFrame(columns)
 
 

@@ -84,7 +84,7 @@ class Diagnosis:
     """Of the value, if propensities are true, whatever the choices that the logs lack are worth;
     up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
-    def as_columns(self) -> dict[str, Any]:
+    def list_columns(self) -> dict[str, Any]:
         """What speaks against the estimates, by name."""
         return {
             "overlap": self.overlap,
@@ -125,11 +125,12 @@ def diagnose(
     totals, effective = np.bincount(weighable.users).astype(np.float64), []
     changes = weighable.weights - weighable.shift(weighable.weights)
     step_user = weighable.users[weighable.session]
-    for rows in _rows_by_place(weighable):
-        totals = np.maximum(totals + np.bincount(step_user[rows], changes[rows], len(totals)), 0)
-        effective.append(effective_number(totals))
     bounds = None
     if weighable.per_decision is None:
+        for rows in weighable.rows_by_place:
+            change = np.bincount(step_user[rows], changes[rows], len(totals))
+            totals = np.maximum(totals + change, 0)
+            effective.append(effective_number(totals))
         observed = float(steps.reward.min()), float(steps.reward.max())
         bounds = identification_bounds(weighable, reward_range or observed)
     return Diagnosis(
@@ -158,10 +159,11 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     step_user = steps.users[steps.session]
     samples = [
         (f"step {place}", ratios[rows], step_user[rows])
-        for place, rows in enumerate(_rows_by_place(steps), start=1)
+        for place, rows in enumerate(steps.rows_by_place, start=1)
+        if steps.per_decision is None
     ]
     samples.append((SESSION_PRODUCTS, weights, steps.users))
-    for number in [] if segment is None else np.unique(segment):
+    for number in () if segment is None else np.unique(segment):
         inside = segment == number
         samples.append((f"segment {number}", weights[inside], steps.users[inside]))
     means = [
@@ -250,14 +252,6 @@ def identification_bounds(
     if len(totals) > 1:
         low, high = min(low, 0.0), max(high, 0.0)
     return float(supported + worth * low), float(supported + worth * high)
-
-
-def _rows_by_place(steps: LoggedSteps) -> list[IntArray]:
-    """The rows of every place in a session, sessions in order; none of sums of sessions."""
-    if steps.per_decision is not None:
-        return []
-    order = np.argsort(steps.step, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(steps.step))[:-1])
 
 
 BEST_FIRST: Final = ("DR", "SNPDIS")
@@ -395,8 +389,8 @@ def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
         )
     mean = diagnosis.mean_weight
-    if any(not test.passed for test in diagnosis.tests):
-        reasons.append(_explain_failure(diagnosis, filter_seen))
+    if failed := [test for test in diagnosis.tests if not test.passed]:
+        reasons.append(_explain_failure(failed, diagnosis, filter_seen))
     elif mean is not None and abs(mean - 1) > FAR_OFF:
         reasons.append(
             f"the mean session weight is {mean:.2f} where 1 is expected: at random, sessions that "
@@ -423,12 +417,14 @@ def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
     return reasons
 
 
-def _explain_failure(diagnosis: Diagnosis, filter_seen: bool) -> str:
+def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis, filter_seen: bool) -> str:
     """What the worst of the failed tests shows."""
-    failed = [test for test in diagnosis.tests if not test.passed]
-    # The products show the size of the error; else the test that is furthest off.
-    off = {test: abs(math.log(max(test.mean, 1e-12))) for test in failed}
-    worst = max(failed, key=lambda test: (test.name == SESSION_PRODUCTS, off[test]))
+
+    def rank(test: WeightTest) -> tuple[bool, float]:
+        # The products show the size of the error; else the test that is furthest off.
+        return test.name == SESSION_PRODUCTS, abs(math.log(max(test.mean, 1e-12)))
+
+    worst = max(failed, key=rank)
     alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
     # Where few users have most of the weight, tests that take means for normal reject too often.
     few_weigh = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.effective_users < ENOUGH_USERS

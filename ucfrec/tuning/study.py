@@ -69,7 +69,7 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
     validation = store.split("validation")
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users)
-    ranker, k = PolicyRanker(trained), min(k, period.n_items)
+    ranker, k = PolicyRanker(trained).scores, min(k, period.n_items)
     rows = UserRows.of(validation, users, store.split("train"))
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
     above, below = measure(period, ranked)[_MEASURES[metric]]

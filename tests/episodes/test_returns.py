@@ -3,13 +3,11 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.errors import InputError
 
 eighths = st.integers(-64, 64).map(lambda n: n / 8)
 """Exact in binary, as are their sums."""
@@ -57,20 +55,6 @@ def test_every_definition_equals_brute_force(
     expected = [slowly(definition, e, t) for e in episodes for t in range(len(e))]
     exact = definition.definition != "discounted"
     np.testing.assert_allclose(got, expected, *((0, 0) if exact else (1e-6, 1e-6)))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"definition": "tomorrow"}, "'tomorrow'; choose from session, discounted, horizon"),
-        ({"discount": 0.0}, "discount 0.0"),
-        ({"discount": 1.5}, "discount 1.5"),
-        ({"horizon": 0}, "horizon 0"),
-    ],
-)
-def test_wrong_definitions_are_refused(wrong: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        ReturnToGo(**wrong)  # type: ignore[arg-type]
 
 
 @given(episodes_of_eighths)

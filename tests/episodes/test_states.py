@@ -129,7 +129,7 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
     [
         ({"tags": torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64)}, "of at most 16"),
         ({"tags": torch.zeros(N_ITEMS, 2)}, "integers"),
-        ({"tags": torch.full((N_ITEMS, 1), N_ITEMS)}, "are not numbers from -1 to"),
+        ({"tags": torch.full((N_ITEMS, 1), N_ITEMS)}, "integers from -1 to"),
         ({"tags": torch.zeros(N_ITEMS - 1, 1, dtype=torch.int64)}, "one row per item"),
         ({"reward_low": 3.0}, "reward_low must be below reward_high"),
         ({"reward_high": float("nan")}, "reward_low must be below reward_high"),

@@ -152,7 +152,7 @@ def test_cql_values_the_better_action_and_presses_unseen_ones_down(tmp_path: Pat
             network.loss(batch)[0].backward()
             optimizer.step()
         played = torch.tensor([[0.5], [-0.5], [0.0]])
-        values[weight] = network.q(torch.zeros(3, 2), played).detach()
+        values[weight] = network.q(torch.zeros(1, 2), played[None])[0].detach()
     assert values[0.0][0] > values[0.0][1] + 0.5
     assert abs(values[0.0][0] - 1) < 0.2
     seen, unseen = values[5.0][:2].mean(), values[5.0][2]

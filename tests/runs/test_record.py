@@ -77,7 +77,7 @@ def test_every_entry_is_checked(folder: Path, tmp_path: Path, kind: str) -> None
         (("config", "train", "steps"), "many", "train.steps is 'many'"),
         (("sizes", "state"), -1, "its sizes.state is -1"),
         (("return_quantiles",), {"half": 1.0}, "its return_quantiles is {'half': 1.0}"),
-        (("return_to_go", "horizon"), 0, "horizon 0"),
+        (("return_to_go", "horizon"), 0, "its return_to_go.horizon is 0"),
         (("data", "unknown_propensities"), "some", "its data.unknown_propensities is 'some'"),
         (("rule", "rule", "temperature"), -1, "temperature"),
     ],

@@ -381,23 +381,18 @@ def _report(
     delta = crm_report.delta[_DELTA_LEVEL]
     bound = delta + epsilon_r
     deviations = bound / crm_report.reward_std
+    change = f"{bound:.3g} ({deviations:.2g} standard deviations)"
     if proposals == 0:
         verdict = "no state is edited"
     elif moves.edits == 0:
-        verdict = (
-            "no edit was accepted: the reward model's median error on held-out steps is "
-            f"{crm_report.delta['0.5']:.3g}, or the generator changes the predicted reward"
-        )
+        median = f"{crm_report.delta['0.5']:.3g}"
+        verdict = f"no edit was accepted; the reward model's median held-out error is {median}"
     elif deviations >= 1:
-        verdict = (
-            f"the bound means nothing: it allows a change of {bound:.3g}, {deviations:.1f} "
-            "standard deviations of the reward; the reward model is too inaccurate"
-        )
+        verdict = f"the bound means nothing: it allows a change of the reward by {change}"
     else:
         verdict = (
-            f"an accepted edit changes the true reward by at most {bound:.3g} ({deviations:.2f} "
-            "standard deviations), provided that the reward model is as accurate at edited states "
-            "as on 95% of held-out steps"
+            f"an accepted edit changes the true reward by at most {change}, provided that the "
+            "reward model is as accurate at edited states as on 95% of held-out steps"
         )
     warnings = [fit_warning(crm_report.r2_without_z), crm_report.warning]
     if moves.edits and moves.mean_move_ratio > 0.5:

@@ -4,7 +4,7 @@ by Algorithm 2, with its quality on held-out steps."""
 import copy
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
@@ -318,8 +318,10 @@ def fit_crm(
         device: where the model is fitted, and stays. What is drawn is the same on all.
     """
     rng = np.random.default_rng(seed)
-    train = _sample(train, config.max_transitions, rng).to(device)
-    held_out = _sample(validation, _VALIDATION_LIMIT, rng).to(device)
+    train, held_out = (
+        steps.at(rng.permutation(len(steps.rewards))[:limit]).to(device)
+        for steps, limit in ((train, config.max_transitions), (validation, _VALIDATION_LIMIT))
+    )
     torch.manual_seed(seed)
     model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
     model = model.to(device)
@@ -490,12 +492,9 @@ def fit_warning(r2_without_z: float) -> str:
 
 def _warning(report: CRMReport) -> str:
     alone = f"state and action alone predict {report.r2_without_z:.1%} of the reward's variance"
-    if report.active_dimensions == 0:
-        unused = f"none of {report.latent_dim} latent dimensions is used"
-        return f"latent collapse: {unused}, so nothing is abduced; {alone}"
-    if report.z_share < 0.01:
-        share = f"z accounts for only {report.z_share:.2%} of the reward's variance"
-        return f"latent near collapse: {share}, so abduction hardly matters; {alone}"
+    if report.active_dimensions == 0 or report.z_share < 0.01:
+        share = f"z accounts for {report.z_share:.2%} of the reward's variance"
+        return f"latent collapse: {share}, so abduction hardly matters; {alone}"
     if report.z_leak > max(_LEAK, 4 / report.validation_transitions**0.5):
         return (
             f"latent leak: z correlates by {report.z_leak:.2f} with what state and action predict, "
@@ -504,12 +503,8 @@ def _warning(report: CRMReport) -> str:
     return ""
 
 
-def _sample(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:
-    rows = torch.from_numpy(rng.permutation(len(transitions.rewards))[:limit])
-    return Transitions(**{f.name: getattr(transitions, f.name)[rows] for f in fields(transitions)})
-
-
 def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
     """(episodes, steps) of a view: all, or `limit` drawn with replacement if there are more."""
-    few = view.n_steps <= limit
-    return view.all_steps() if few else view.draw_steps(np.random.default_rng(seed), limit)
+    if view.n_steps <= limit:
+        return view.all_steps()
+    return view.draw_steps(np.random.default_rng(seed), limit)

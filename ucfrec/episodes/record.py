@@ -1,6 +1,7 @@
 """`meta.json`, the record of an episode store: its version, columns, counts and checksums."""
 
 from collections.abc import Mapping
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
@@ -140,10 +141,10 @@ class StoreRecord(Record):
                 it.
         """
         record = super().read(folder)
-        shards = [folder / f"shard-{n:05d}" for n in (0, record.n_shards - 1)]
-        if not 1 <= record.n_shards <= record.n_episodes or not all(s.is_dir() for s in shards):
+        names = (folder / f"shard-{n:05d}" for n in range(record.n_shards))
+        shards = list(takewhile(Path.is_dir, names))
+        if not 1 <= len(shards) == record.n_shards <= record.n_episodes:
             raise record._bad(folder, "n_shards", record.n_shards)
-        shards = [folder / f"shard-{n:05d}" for n in range(record.n_shards)]
         # Before memory for an entry per step is allocated: the files can hold the steps.
         files = [file for s in shards if (file := s / f"{schema.REWARD}.npy").is_file()]
         size = np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize

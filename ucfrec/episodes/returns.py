@@ -1,14 +1,13 @@
 """Returns-to-go, defined once for training, acting and scoring."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
-from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,26 +22,13 @@ class ReturnToGo:
     - `session`: the whole rest of the session, Σ_{k≥t} r_k (paper section 2.1).
     - `discounted`: Σ_{k≥t} γ^{k−t} r_k.
     - `horizon`: the next h steps, Σ_{t≤k<t+h} r_k.
-
-    Raises:
-        InputError: the definition is unknown, γ is not in (0, 1], or h is below 1.
     """
 
     definition: Definition = "session"
-    discount: float = 0.9
+    discount: Annotated[float, Field(gt=0, le=1)] = 0.9
     """γ of `discounted`."""
-    horizon: int = 1
+    horizon: Annotated[int, Field(ge=1)] = 1
     """h of `horizon`, steps."""
-
-    def __post_init__(self) -> None:
-        if self.definition not in get_args(Definition):
-            names = ", ".join(get_args(Definition))
-            raise InputError(f"no return-to-go is called {self.definition!r}; choose from {names}")
-        if not 0 < self.discount <= 1 or self.horizon < 1:
-            raise InputError(
-                f"the return-to-go has discount {self.discount} and horizon {self.horizon}; give a "
-                "discount above 0, at most 1, and a horizon of 1 step or more"
-            )
 
     @property
     def per_session(self) -> bool:
@@ -110,18 +96,6 @@ class ReturnToGo:
             beyond = (steps + self.horizon - length).clamp(min=0).double() / self.horizon
             returns = sums[:, ends] - sums[:, :-1] + beyond.to(last) * last
         return torch.cat([returns, last], dim=1).float()
-
-
-def returns_in_parts(
-    rewards: npt.NDArray[np.floating], offsets: IntArray, steps: int
-) -> Iterator[Float32Array]:
-    """`ReturnToGo().of_logs` in parts of about `steps` steps, to save memory."""
-    begin = 0
-    while begin < len(offsets) - 1:
-        end = max(int(np.searchsorted(offsets, offsets[begin] + steps)), begin + 1)
-        part = offsets[begin : end + 1]
-        yield ReturnToGo().of_logs(rewards[part[0] : part[-1]], part - part[0])
-        begin = end
 
 
 def _discount(

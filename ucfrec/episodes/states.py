@@ -6,9 +6,9 @@ operations in a fixed order, so its results are bit-identical for every batch si
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -62,21 +62,19 @@ class ItemStates:
     none. States do not contain them: they show which items are alike."""
 
     def __post_init__(self) -> None:
-        if any(
-            table.dim() != 2 or not table.is_floating_point()
-            for table in (self.embeddings, self.user_features)
-        ):
+        tables, tags = (self.embeddings, self.user_features), self.tags
+        if any(table.dim() != 2 or not table.is_floating_point() for table in tables):
             raise InputError("embeddings and user features of item states must be real matrices")
         # Tags are numbered without gaps, so that no number exceeds their count.
-        tags, most = self.tags, min(self.tags.numel(), DISTINCT_TAGS) - 1
+        most = min(tags.numel(), DISTINCT_TAGS) - 1
         shaped = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
-        if tags.dtype != torch.int64 or not shaped or tags.shape[1] > TAGS_PER_ITEM:
+        numbered = not tags.numel() or -1 <= int(tags.min()) <= int(tags.max()) <= most
+        narrow = shaped and tags.shape[1] <= TAGS_PER_ITEM
+        if not (narrow and numbered and tags.dtype == torch.int64):
             raise InputError(
-                f"tags of item states must be integers, one row per item, of at most "
-                f"{TAGS_PER_ITEM}"
+                f"tags of item states must be integers from -1 to {most}, one row per item, of at "
+                f"most {TAGS_PER_ITEM}"
             )
-        if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
-            raise InputError(f"tags of item states are not numbers from -1 to {most}")
         whole = type(self.window) is int and 1 <= self.window <= 10_000
         if not (whole and _is_real(self.decay) and 0 <= self.decay <= 1):
             raise InputError(
@@ -162,8 +160,8 @@ class ItemStates:
         """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
-            states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
-            return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
+            arguments: dict[str, Any] = {**tensors, **numbers}
+            return cls(**arguments)
 
 
 def _is_real(value: object) -> bool:
@@ -211,9 +209,8 @@ class TrainingCounts:
             names.append(schema.TIMESTAMP)
             last = int(train.column(schema.TIMESTAMP).max())
         for items, rewards, *times in train.column_batches(*names):
-            weights = np.ones(len(items))
-            if timed:
-                weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
+            ages = last - times[0].astype(np.int64) if timed else np.zeros(len(items))
+            weights = np.exp2(-ages / (half_life * _HOUR_MS))
             shown += np.bincount(items, weights, n_items)
             liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
         counts = torch.from_numpy(np.stack([shown, liked])).to(

@@ -18,7 +18,8 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import LONG, Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.view import Columns, EpisodeView, StepColumn, list_earlier
+from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
+from ucfrec.episodes.windows import list_earlier
 from ucfrec.episodes.writer import StoreWriter, require_finite, require_steps
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
@@ -254,16 +255,14 @@ class EpisodeStore(EpisodeView):
     def state_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, each (S,) float32, of the states of the view, computed in
         float64 from at most 100,000 steps, evenly spaced over it."""
-        stride = -(-self.n_steps // _STATISTICS_STEPS)
-        total = torch.zeros(self.state_size, dtype=torch.float64)
-        squares, count = total.clone(), 0
-        for chunk in range(0, self.n_steps, stride * 8192):
-            part = np.arange(chunk, min(chunk + stride * 8192, self.n_steps), stride)
-            states = self.windows(*self.locate(part), 1).states[:, 0].double()
+        numbers = np.arange(0, self.n_steps, -(-self.n_steps // _STATISTICS_STEPS))
+        total = squares = torch.zeros(self.state_size, dtype=torch.float64)
+        for begin in range(0, len(numbers), 8192):
+            part = self.locate(numbers[begin : begin + 8192])
+            states = self.windows(*part, 1).states[:, 0].double()
             total, squares = total + states.sum(0), squares + states.square().sum(0)
-            count += len(states)
-        mean = total / count
-        variance = (squares / count - mean.square()).clamp(min=0)
+        mean = total / len(numbers)
+        variance = (squares / len(numbers) - mean.square()).clamp(min=0)
         return mean.float(), variance.sqrt().float()
 
 
@@ -300,11 +299,12 @@ class UserRows:
             np.minimum.at(begins, owner, times)
             users_later = later.episode_values(schema.USER).astype(np.int64)
             users_earlier = earlier.episode_values(schema.USER).astype(np.int64)
-            # Owner of each user of the earlier store, and −1 for the user −1, the last.
-            owner_of = np.full(max(int(users_later.max(initial=-1)), 0) + 2, -1)
-            owner_of[users_later[users_later >= 0]] = owners[users_later >= 0]
-            is_listed = users_earlier < len(owner_of) - 1
-            owners_earlier = owner_of[np.where(is_listed, users_earlier, -1)]
+            # Owner of each user, and −1 for the user −1, the last.
+            owner_of = np.full(
+                max(users_later.max(initial=0), users_earlier.max(initial=0)) + 2, -1
+            )
+            owner_of[users_later], owner_of[-1] = owners, -1
+            owners_earlier = owner_of[users_earlier]
             parts, taken = [(owner, times, source)], 0
             for episodes, steps in earlier.step_batches():
                 owner = owners_earlier[episodes]

@@ -16,8 +16,8 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Transitions, Windows
-from ucfrec.errors import InputError, one_line
+from ucfrec.episodes.windows import Transitions, Windows, list_earlier
+from ucfrec.errors import InputError
 
 _DTYPES: Final = {
     schema.OFFSETS: "<i8",
@@ -72,7 +72,9 @@ class Columns:
         folder's files, of which none may be missing or have another size than when written."""
         self.path, self.record = path, record
         record.require(path)
-        self._arrays, self._given_states = dict(arrays or {}), item_states
+        self._arrays = dict(arrays or {})
+        if item_states is not None:
+            self.item_states = item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
         self.has_items = schema.ITEM in record.columns
@@ -111,15 +113,13 @@ class Columns:
     @cached_property
     def item_states(self) -> ItemStates:
         """See `EpisodeView.item_states`."""
-        if self._given_states is not None:
-            return self._given_states
         self.record.require(self.path, ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
 
     @property
     def has_item_states(self) -> bool:
         """Whether the store has `item_states`, in memory or as a file."""
-        return self._given_states is not None or (self.path / ITEM_STATES).is_file()
+        return "item_states" in vars(self) or (self.path / ITEM_STATES).is_file()
 
     @cached_property
     def user_rows(self) -> IntArray:
@@ -170,23 +170,19 @@ class Columns:
         """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
-        shape, parts = tuple(self.record.columns.get(name, ())), []
+        expected = np.dtype(_DTYPES[name]), tuple(self.record.columns.get(name, ()))
+        parts = []
         for shard in self._shards:
             path = shard / f"{name}.npy"
             self.record.require(self.path, f"{shard.name}/{name}.npy")
             try:
                 # Mapping compares the header with the size of the file before it takes memory.
                 values: Array = np.load(path, mmap_mode="r")
+                if (values.dtype, values.shape[1:]) != expected or values.ndim == 0:
+                    raise ValueError(f"it holds {values.dtype} in the shape {values.shape}")
             except Exception as error:  # numpy parses headers as Python and raises what that raises
-                message = one_line(str(error)) or type(error).__name__
-                raise InputError(
-                    f"{path} is missing or damaged ({message}); {StoreRecord.REMEDY}"
-                ) from None
-            if values.dtype != _DTYPES[name] or values.shape[1:] != shape or values.ndim == 0:
-                raise InputError(
-                    f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; "
-                    f"{StoreRecord.REMEDY}"
-                )
+                what = f"{path} is missing or damaged ({str(error) or type(error).__name__})"
+                raise InputError(f"{what}; {StoreRecord.REMEDY}") from None
             parts.append(values if mmap else np.array(values))
         return parts
 
@@ -338,12 +334,6 @@ class EpisodeView:
         rewards = self.step_values(schema.REWARD, episodes[owner], earlier_steps)
         return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
 
-    def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
-        """(rows, items), each (M,): the items that sessions (B,) showed before steps (B,); rows are
-        indices into the B."""
-        owner, earlier_steps = list_earlier(steps)
-        return owner, self.step_values(schema.ITEM, episodes[owner], earlier_steps).astype(np.int64)
-
     def all_steps(self) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
@@ -451,9 +441,3 @@ class EpisodeView:
                 f"episode {episodes[row]} has {lengths[row]} steps, none numbered {ends[row]}; "
                 "steps are numbered from 0"
             )
-
-
-def list_earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
-    """Row and number of every step before the given ones (B,), row by row."""
-    owner = np.repeat(np.arange(len(steps)), steps)
-    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)

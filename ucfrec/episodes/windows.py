@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -23,18 +23,26 @@ AUGMENTED: Final = "augmented.safetensors"
 """Name of the file of a run."""
 
 
-_Rows = TypeVar("_Rows", "Windows", "Transitions", "Sessions")
+@dataclass(frozen=True)
+class _Rows:
+    """Tensors with a row for each of B things."""
 
+    def _change(self, change: Callable[[Tensor], Tensor]) -> Self:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        changed = {name: change(value) for name, value in values.items() if value is not None}
+        return replace(self, **changed)
 
-def _each(rows: _Rows, change: Callable[[Tensor], Tensor]) -> _Rows:
-    """A copy in which every tensor is changed."""
-    values = {field.name: getattr(rows, field.name) for field in fields(rows)}
-    changed = {name: change(value) for name, value in values.items() if value is not None}
-    return replace(rows, **changed)
+    def at(self, rows: slice | IntArray | Tensor) -> Self:
+        """The rows with the given numbers."""
+        return self._change(lambda values: values[rows])
+
+    def to(self, device: torch.device) -> Self:
+        """A copy on `device`."""
+        return self._change(lambda values: values.to(device, non_blocking=True))
 
 
 @dataclass(frozen=True)
-class Windows:
+class Windows(_Rows):
     """B windows of K steps, padded on the left; at padding all values are 0 and `mask` is false."""
 
     states: Tensor
@@ -87,21 +95,13 @@ class Windows:
         names = [f.name for f in fields(cls)]
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
-    def at(self, rows: slice | Tensor) -> "Windows":
-        """The windows with the given numbers."""
-        return _each(self, lambda values: values[rows])
-
     def last(self, steps: int) -> "Windows":
         """The windows of this number of last steps."""
-        return _each(self, lambda values: values[:, -steps:])
-
-    def to(self, device: torch.device) -> "Windows":
-        """A copy of the windows on `device`."""
-        return _each(self, lambda values: values.to(device, non_blocking=True))
+        return self._change(lambda values: values[:, -steps:])
 
 
 @dataclass(frozen=True)
-class Transitions:
+class Transitions(_Rows):
     """M single steps."""
 
     states: Tensor
@@ -114,10 +114,6 @@ class Transitions:
     """(M, S) next states as logged; zeros at the last step of an episode."""
     last: Tensor
     """(M,) bool, true at the last step of an episode."""
-
-    def to(self, device: torch.device) -> "Transitions":
-        """The steps on `device`."""
-        return _each(self, lambda values: values.to(device))
 
 
 class Shown(NamedTuple):
@@ -201,7 +197,7 @@ def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Sessions:
+class Sessions(_Rows):
     """B sessions, each before the step to decide."""
 
     actions: Tensor
@@ -284,10 +280,6 @@ class Sessions:
             states=store.windows(episodes, steps, context).states,
         )
 
-    def at(self, rows: slice | IntArray | Tensor) -> "Sessions":
-        """The sessions with the given numbers."""
-        return _each(self, lambda values: values[rows])
-
     def begin(self, rows: IntArray) -> None:
         """Let new sessions begin at the positions `rows`, of whichever users there are."""
         self.actions[rows] = -1
@@ -353,10 +345,17 @@ class Sessions:
 
 def seen_before(store: "EpisodeStore", episodes: IntArray, steps: IntArray) -> Tensor:
     """(B, n_items) bool: the known items that sessions (B,) showed before steps (B,)."""
-    rows, items = store.items_before(episodes, steps)
+    rows, earlier_steps = list_earlier(steps)
+    items = store.step_values(schema.ITEM, episodes[rows], earlier_steps).astype(np.int64)
     seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
     seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
     return seen
+
+
+def list_earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
+    """Row and number of every step before the given ones (B,), row by row."""
+    owner = np.repeat(np.arange(len(steps)), steps)
+    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
 
 
 def _no_integers() -> IntArray:

@@ -11,7 +11,7 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
-from ucfrec.episodes.returns import returns_in_parts
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 
@@ -53,52 +53,38 @@ class StoreWriter:
 
         Raises:
             InputError: columns differ in length, or rewards are not finite.
-            ValueError: the very first step does not begin an episode.
         """
         first = np.asarray(first, dtype=bool)
         for name, values in (*steps.items(), *episodes.items()):
             if len(values) != len(first):
                 raise InputError(f"column {name!r} has {len(values)} steps instead of {len(first)}")
         require_finite(steps[schema.REWARD])
-        if len(first) == 0:
-            return
-        if not (self._split_counts.any() or first[0]):
-            raise ValueError("the first step of a store must begin an episode")
         starts, begin = np.flatnonzero(first), 0
         while begin < len(first):
             full = begin + self._shard_steps - self._steps_in_shard
             later = starts[np.searchsorted(starts, full) :]
             end = int(later[0]) if len(later) else len(first)
-            self._append(steps, first, episodes, slice(begin, end))
+            rows, begins = slice(begin, end), starts[(starts >= begin) & (starts < end)]
+            for name, values in steps.items():
+                column = np.ascontiguousarray(values[rows], dtype=schema.STEP_DTYPES[name])
+                self._shapes.setdefault(name, list(column.shape[1:]))
+                if name not in self._files:
+                    self._files[name] = _NpyFile(self._shard / f"{name}.npy")
+                self._files[name].append(column)
+                self._hash(name, column)
+            for name, values in episodes.items():
+                column = np.asarray(values)[begins].astype(schema.EPISODE_DTYPES[name])
+                self._episode_values.setdefault(name, []).append(column)
+                self._hash(name, column)
+            self._hash("first", first[rows].view(np.uint8))
+            self._offsets.append(begins - begin + self._steps_in_shard)
+            split = np.asarray(episodes[schema.SPLIT])
+            for place, counted in enumerate((split[begins], split[rows])):
+                self._split_counts[:, place] += np.bincount(counted, minlength=len(schema.SPLITS))
+            self._steps_in_shard += end - begin
             if len(later):
                 self._close_shard()
             begin = end
-
-    def _append(
-        self,
-        steps: Mapping[str, Array],
-        first: BoolArray,
-        episodes: Mapping[str, Array],
-        rows: slice,
-    ) -> None:
-        starts = np.flatnonzero(first[rows])
-        for name, values in steps.items():
-            column = np.ascontiguousarray(values[rows], dtype=schema.STEP_DTYPES[name])
-            self._shapes.setdefault(name, list(column.shape[1:]))
-            if name not in self._files:
-                self._files[name] = _NpyFile(self._shard / f"{name}.npy")
-            self._files[name].append(column)
-            self._hash(name, column)
-        for name, values in episodes.items():
-            column = np.asarray(values)[rows][starts].astype(schema.EPISODE_DTYPES[name])
-            self._episode_values.setdefault(name, []).append(column)
-            self._hash(name, column)
-        self._hash("first", first[rows].view(np.uint8))
-        self._offsets.append(starts + self._steps_in_shard)
-        split = np.asarray(episodes[schema.SPLIT])[rows]
-        for place, counted in enumerate((split[starts], split)):
-            self._split_counts[:, place] += np.bincount(counted, minlength=len(schema.SPLITS))
-        self._steps_in_shard += len(split)
 
     @property
     def _shard(self) -> Path:
@@ -118,8 +104,12 @@ class StoreWriter:
             np.save(self._shard / f"{name}.npy", np.concatenate(values))
         rewards = np.load(self._shard / f"{schema.REWARD}.npy", mmap_mode="r")
         returns = _NpyFile(self._shard / f"{schema.RETURN_TO_GO}.npy")
-        for part in returns_in_parts(rewards, offsets, _PART_STEPS):
-            returns.append(part)
+        begin = 0
+        while begin < len(offsets) - 1:
+            end = max(int(np.searchsorted(offsets, offsets[begin] + _PART_STEPS)), begin + 1)
+            part = offsets[begin : end + 1]
+            returns.append(ReturnToGo().of_logs(rewards[part[0] : part[-1]], part - part[0]))
+            begin = end
         returns.close()
         self._files, self._offsets, self._episode_values = {}, [], {}
         self._shards += 1
@@ -248,21 +238,16 @@ def require_steps(path: Path | str, lengths: Array) -> IntArray:
 
 
 def require_finite(rewards: Array) -> None:
-    """Raise an InputError for rewards (N,) that are NaN, infinite, or so large that training would
-    overflow: one of them would spoil a shard's returns."""
+    """Raise an InputError for rewards (N,) that are NaN or so large that training would overflow:
+    one of them would spoil a shard's returns."""
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
-    not_finite = int(np.count_nonzero(~np.isfinite(stored)))
-    if not_finite:
+    refused = np.count_nonzero(~(np.abs(stored) <= schema.LARGEST_REWARD))
+    if refused:
         raise InputError(
-            f"{not_finite} of {len(stored)} rewards are not finite; drop those rows or correct the "
-            "reward expression"
-        )
-    large = int(np.count_nonzero(np.abs(stored) > schema.LARGEST_REWARD))
-    if large:
-        raise InputError(
-            f"{large} of {len(stored)} rewards are beyond ±{schema.LARGEST_REWARD:g}, too large to "
-            "train with in float32; divide them"
+            f"{refused} of {len(stored)} rewards are not finite or beyond "
+            f"±{schema.LARGEST_REWARD:g}, too large to train with in float32; drop those rows, or "
+            "correct the reward expression"
         )
 
 

@@ -73,8 +73,9 @@ class ConservativeQ(nn.Module):
         self.target.requires_grad_(False)
 
     def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
-        """Values (M,) of states (M, S) and actions (M, A), by `network` or the trained network."""
+        """Values (M, C) of actions (M, C, A) in states (M, S), by `network` or the trained one."""
         states = standardise(states, self.state_mean, self.state_std)
+        states = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
         value: Tensor = (network or self.network)(torch.cat([states, actions], dim=-1))
         return value.squeeze(-1)
 
@@ -89,15 +90,9 @@ class ConservativeQ(nn.Module):
             uniform = low + (high - low) * torch.rand((*shape, len(low)))
         return torch.cat([logged, uniform], dim=1)
 
-    def compare(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
-        """Values (M, C) of candidate actions (M, C, A) in states (M, S)."""
-        repeated = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
-        flat = self.q(repeated.flatten(0, 1), actions.flatten(0, 1), network)
-        return flat.view(len(states), -1)
-
     def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
         """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over candidates."""
-        values = self.compare(states, self.candidates(len(states)), network)
+        values = self.q(states, self.candidates(len(states)), network)
         return (values.softmax(-1) * values).sum(-1)
 
     def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
@@ -107,8 +102,8 @@ class ConservativeQ(nn.Module):
                 slow.lerp_(fast, _TARGET_RATE)
             next_values = self.state_values(batch.next_states, self.target)
             target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
-        value = self.q(batch.states, batch.actions)
-        values = self.compare(batch.states, self.candidates(len(value)))
+        value = self.q(batch.states, batch.actions.unsqueeze(1))[:, 0]
+        values = self.q(batch.states, self.candidates(len(value)))
         soft_maximum = torch.cat([values, value.unsqueeze(1)], dim=1).logsumexp(-1)
         conservative = (soft_maximum - value).mean()
         error = 0.5 * F.mse_loss(value, target)

@@ -408,7 +408,6 @@ class StackedStreams:
         with torch.no_grad():
             layers = zip(*(stream.blocks for stream in streams), strict=True)
             self._blocks = [_stack_blocks(blocks) for blocks in layers]
-            self._eps = float(policy.return_stream.blocks[0].norm.eps)  # type: ignore[arg-type,union-attr]
             self._fuse = torch.stack([part.T for part in policy.fuse.weight.chunk(3, dim=1)])
             # The sum over the modalities known so far begins with the bias.
             self._fuse_bias = policy.fuse.bias.expand(3, 1, -1)
@@ -429,7 +428,7 @@ class StackedStreams:
             steps = tokens if mask is None else tokens.masked_fill(~mask.unsqueeze(-1), 0.0)
             local = shift_products(steps, taps, bias).view(3, -1, dim)
             rows = torch.baddbmm(pointwise_bias, local, pointwise)
-            normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,), eps=self._eps)
+            normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,))
             tokens = torch.addcmul(shift, normed, scale)
         rows = tokens.view(3, -1, dim)
         sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)

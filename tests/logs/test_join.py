@@ -233,7 +233,7 @@ def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
 def test_a_full_disk_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: str, disk: str
 ) -> None:
-    monkeypatch.setattr("ucfrec.logs.join.write_batches", Mock(side_effect=OSError(error)))
+    monkeypatch.setattr("ucfrec.logs.join.table_writer", Mock(side_effect=OSError(error)))
     with pytest.raises(InputError, match=f"no space left on the disk of {disk.format(tmp_path)};"):
         joined(tmp_path, feedback([(1, 10, 7, 1)]))
 

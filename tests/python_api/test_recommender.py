@@ -297,7 +297,7 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
     for given in (ranking, [ranking]):
         with pytest.raises(InputError, match="type Ranking; give what evaluate or ope returned"):
             clicked.report(tmp_path / "no.html", given)
-    with pytest.raises(InputError, match="is a folder; name a file, e"):
+    with pytest.raises(InputError, match="is a folder, a file is needed"):
         clicked.report(tmp_path)
     card = (clicked.run / "MODEL_CARD.md").read_text(encoding="utf-8")
     assert "ucfrec rank" in card

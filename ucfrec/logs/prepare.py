@@ -138,6 +138,10 @@ def prepare(
     exists, or the disk is full.
     """
     options, out = options or PrepareOptions(), Path(out)
+    if hasattr(paths, "columns"):
+        raise InputError(
+            "paths is a frame; give log files, folders or globs here, and frames to Recommender.fit"
+        )
     files = log_files(paths)
     if like is not None and not (like / sessions.USERS_FILE).is_file():
         raise InputError(

@@ -32,7 +32,7 @@ def test_a_value_is_within_its_interval_of_the_simulated_one(tmp_path: Path, gai
     logged = rewards.ravel().astype(np.float32)
     Trajectories(*flat, logged, lengths, cut, None, source).write_store(tmp_path / "store")
     fit = _Model(EpisodeStore.open(tmp_path / "store"), DISCOUNT).fit(-gain * flat[0])
-    assert fit.settled
+    assert fit.converged
     # All states of a policy count, so the simulated episodes have to last as long as they can.
     later = np.concatenate([simulate(gain, 0.0, 4000, seed)[2] for seed in (1, 2)])
     values = later @ DISCOUNT ** np.arange(STEPS)

@@ -205,7 +205,11 @@ def random_state_kept() -> Iterator[None]:
 
 @contextmanager
 def progress(
-    total: float | None, job: str, unit: str, done: float = 0, shown: bool = True
+    total: float | None,
+    job: str,
+    unit: str,
+    done: float = 0,
+    shown: bool = True,
 ) -> Iterator[Progress]:
     """Display on stderr the finished share of a job, its rate and the estimated time left.
 

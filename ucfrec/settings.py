@@ -122,7 +122,10 @@ def _convert_lists(value: Any) -> Any:
 
 
 def _setting_error(
-    table: Any, name: str, error: ValidationError, values: Mapping[str, Any]
+    table: Any,
+    name: str,
+    error: ValidationError,
+    values: Mapping[str, Any],
 ) -> SettingError:
     """The first of pydantic's errors, as one line."""
     first, infos = error.errors(include_url=False)[0], table.__pydantic_fields__
@@ -194,7 +197,12 @@ def shown(value: object) -> str:
     return reprlib.repr(value) if written else f"a value of type {type(value).__name__}"
 
 
-def require_whole(name: str, value: object, least: int = 1, most: int | None = None) -> int:
+def require_whole(
+    name: str,
+    value: object,
+    least: int = 1,
+    most: int | None = None,
+) -> int:
     """The whole number, NumPy's too, that `value` is; InputError if it is none, below `least` or
     above `most`."""
     try:
@@ -247,7 +255,12 @@ def require_kind(what: str, *kinds: Any) -> Check:
     return check
 
 
-def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -> list[_Value]:
+def require_list(
+    name: str,
+    argument: object,
+    what: str,
+    *kinds: type[_Value],
+) -> list[_Value]:
     """The values of an argument that is one of `kinds`, or any number of them.
 
     Raises:

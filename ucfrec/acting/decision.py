@@ -127,7 +127,12 @@ class DecisionRule:
         """12 hexadecimal digits that distinguish rules, for results."""
         return config_hash(self.as_dict())
 
-    def target_returns(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
+    def target_returns(
+        self,
+        returns: ReturnToGo,
+        collected: Tensor,
+        best: Tensor | None,
+    ) -> Tensor:
         """Target returns at the next step, (B,) float64, in reward units.
 
         Args:
@@ -162,7 +167,12 @@ class DecisionRule:
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
-    def rank_items(self, scores: Tensor, k: int, uniforms: Tensor | None) -> tuple[Tensor, Tensor]:
+    def rank_items(
+        self,
+        scores: Tensor,
+        k: int,
+        uniforms: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
         """`k` different items (B, k) in the order shown, best first or drawn one after the other,
         and their propensities (B, k) float64.
 

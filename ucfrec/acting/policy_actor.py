@@ -151,7 +151,10 @@ class PolicyActor:
         return items if self._item_ids is None else self._item_ids[items], chances.numpy()
 
     def _decide(
-        self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
+        self,
+        rows: Tensor,
+        sessions: Sessions,
+        excluded: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """Items and their probabilities, (M,) each, of the `rows` (M,); see `Scorer.scores`."""
         scores = self._scorer.scores(sessions, excluded=excluded)

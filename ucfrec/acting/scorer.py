@@ -208,7 +208,10 @@ class Scorer:
 
     @torch.no_grad()
     def query(
-        self, sessions: Sessions, windows: Windows | None = None, rewards: bool | None = None
+        self,
+        sessions: Sessions,
+        windows: Windows | None = None,
+        rewards: bool | None = None,
     ) -> Query:
         """All of the scores that does not grow with the items, before it is weighted.
 
@@ -315,7 +318,11 @@ class Scorer:
 
     @torch.inference_mode()
     def scores_of_some(
-        self, query: Query, part: Part, candidates: Tensor, products: Tensor
+        self,
+        query: Query,
+        part: Part,
+        candidates: Tensor,
+        products: Tensor,
     ) -> Tensor:
         """Scores (B, C) of some items; −∞ for those that the rule's tags exclude, even if no
         others remain.
@@ -331,7 +338,12 @@ class Scorer:
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
-    def _add_lookahead(self, scores: Tensor, odds: Tensor, query: Query) -> Tensor:
+    def _add_lookahead(
+        self,
+        scores: Tensor,
+        odds: Tensor,
+        query: Query,
+    ) -> Tensor:
         """Scores of the policy plus expected reward and lookahead, (B, n_items).
 
         Only the best items by policy and reward are asked whether they end the session; others
@@ -368,7 +380,10 @@ class _ItemProduct:
     """
 
     def __init__(
-        self, policy: SequencePolicy, model: ItemRewardModel | None, states: ItemStates | None
+        self,
+        policy: SequencePolicy,
+        model: ItemRewardModel | None,
+        states: ItemStates | None,
     ) -> None:
         self._policy, self._model, self._states = policy, model, states
         head, kind = policy.head, type(policy)
@@ -482,7 +497,12 @@ class _ItemProduct:
         """Whether what was shown counts."""
         return self._likeness is not None and (rewards or (policy and self._exposure is not None))
 
-    def weigh(self, query: Query, policy: bool, reward_weight: float) -> Part:
+    def weigh(
+        self,
+        query: Query,
+        policy: bool,
+        reward_weight: float,
+    ) -> Part:
         """The weighted sum of the parts; without a part, the rows of its own are excluded."""
         items, model = query.items, query.model if reward_weight else None
         repeated = alike = torch.zeros_like(items, dtype=torch.float32)
@@ -500,7 +520,12 @@ class _ItemProduct:
             factors.append(reward_weight * model.factors)
         return Part(torch.cat(factors, 1) if factors else repeated[:, :0], repeated, alike)
 
-    def scores(self, query: Query, policy: bool, reward_weight: float) -> Tensor:
+    def scores(
+        self,
+        query: Query,
+        policy: bool,
+        reward_weight: float,
+    ) -> Tensor:
         """(B, n_items) of the policy and the weighted reward model, up to a constant per row."""
         items, outputs = query.items, query.outputs if policy else None
         if outputs is not None and not reward_weight:
@@ -516,7 +541,13 @@ class _ItemProduct:
         repeated = part.repeated.masked_fill(items < 0, 0.0)
         return scores.scatter_add_(1, items.clamp(min=0), repeated)
 
-    def addends(self, items: Tensor, part: Part, candidates: Tensor, rewards: bool) -> Tensor:
+    def addends(
+        self,
+        items: Tensor,
+        part: Part,
+        candidates: Tensor,
+        rewards: bool,
+    ) -> Tensor:
         """(B, C) what scores of the policy are more than products, for candidates (B, C)."""
         added = torch.zeros(candidates.shape)
         if not self._counts_shown(True, rewards):
@@ -528,7 +559,10 @@ class _ItemProduct:
         return added + (same * part.repeated.unsqueeze(1)).sum(2)
 
     def without_tags(
-        self, rule: DecisionRule, recent: Shown, items: Tensor | None = None
+        self,
+        rule: DecisionRule,
+        recent: Shown,
+        items: Tensor | None = None,
     ) -> Iterator[Tensor]:
         """What each tag filter of the rule excludes, (B, n_items) bool, or (B, C) of items."""
         if rule.tag_window:
@@ -560,7 +594,10 @@ def _pad(values: Tensor, length: int, padding: int) -> Tensor:
 
 
 def sessions_before(
-    scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
+    scorer: Scorer,
+    store: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
 ) -> Sessions:
     """What was known before steps (B,) of episodes (B,) of logs with the training's items."""
     return Sessions.from_store(store, episodes, steps, scorer.policy.config.context, scorer.reach)

@@ -272,7 +272,10 @@ class Plan:
                 )
 
     def list_built_in(
-        self, table: str, task: Task, methods: Mapping[str, Method]
+        self,
+        table: str,
+        task: Task,
+        methods: Mapping[str, Method],
     ) -> Iterator[Cell]:
         """One cell for each built-in policy of the task's environments, told apart from one of
         `methods` with its name."""

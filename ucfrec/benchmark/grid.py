@@ -63,13 +63,19 @@ def run_grid(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
     )
     if missing:
-        calls = {name: partial(_measure, how.measure, results, *tasks[name]) for name in missing}
+        calls = {}
+        for name in missing:
+            key, cell = tasks[name]
+            calls[name] = partial(_measure, how.measure, results, key, cell)
         rows |= _measure_all(calls, workers, describe)
     return [row for group in rows.values() for row in group]
 
 
 def _measure(
-    measure: Callable[[Cell, RowKey], list[ResultRow]], results: Path, key: RowKey, cell: Cell
+    measure: Callable[[Cell, RowKey], list[ResultRow]],
+    results: Path,
+    key: RowKey,
+    cell: Cell,
 ) -> list[ResultRow]:
     """Measure a cell, append its rows and return them."""
     reset_peak_memory()

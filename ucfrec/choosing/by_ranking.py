@@ -50,7 +50,11 @@ class LoggedScores:
     share is computed once, and kept where the policy has factors, which are few numbers."""
 
     def __init__(
-        self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
+        self,
+        scorer: Scorer,
+        view: EpisodeStore,
+        episodes: IntArray,
+        steps: IntArray,
     ) -> None:
         self.view, self.episodes, self.steps = view, episodes, steps
         self.items = view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
@@ -89,7 +93,13 @@ class LoggedScores:
 class LoggedEvidence:
     """Validation sessions on which rules of one policy are compared with the log."""
 
-    def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
+    def __init__(
+        self,
+        scorer: Scorer,
+        view: EpisodeStore,
+        most: int,
+        seed: int,
+    ) -> None:
         """Draws about `most` steps of whole sessions of a view."""
         view = view.select(np.sort(draw_episodes(view, most, [seed, 7])))
         episodes, steps = view.all_steps()

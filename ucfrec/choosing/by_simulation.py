@@ -79,7 +79,13 @@ class _ManyRules(PolicyActor):
     """Acts by the rule of each session: n sessions by each of several scorers of one policy, each
     with a generator of its own, so that it draws what it would draw alone."""
 
-    def __init__(self, scorers: Sequence[Scorer], n: int, store: EpisodeStore, seed: int) -> None:
+    def __init__(
+        self,
+        scorers: Sequence[Scorer],
+        n: int,
+        store: EpisodeStore,
+        seed: int,
+    ) -> None:
         states, rows = store.item_states, len(scorers) * n
         users = np.arange(len(states.user_features))
         super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
@@ -92,7 +98,10 @@ class _ManyRules(PolicyActor):
         self._rule = self._rule[rows]
 
     def _decide(
-        self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
+        self,
+        rows: Tensor,
+        sessions: Sessions,
+        excluded: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         decisions = []
         most = max(1, _SCORES_AT_ONCE // self._n_items)
@@ -117,7 +126,12 @@ def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:
     batches of about `_ROWS_AT_ONCE` rows, or as many as one part."""
     numbers, first = np.unique(rules, return_index=True)
     batches, size = [list[tuple[int, slice]]()], 0
-    for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
+    for rule, begin, end in zip(
+        numbers,
+        first,
+        [*first[1:], len(rules)],
+        strict=True,
+    ):
         for start in range(int(begin), int(end), most):
             stop = min(start + most, int(end))
             if size and size + stop - start > min(_ROWS_AT_ONCE, most):
@@ -356,7 +370,12 @@ class RuleSearch:
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")
         return ValueEstimate(value, error, values, optimism, tuple(doubts))
 
-    def _roll_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
+    def _roll_half(
+        self,
+        rule: DecisionRule,
+        number: int,
+        part: int = 0,
+    ) -> Outcomes:
         """Sessions of one half of the users, with its own calibration; each part has others."""
         users, n = number_users(self._store), self._config.sessions
         episodes = np.flatnonzero(users % 2 == number)

@@ -183,7 +183,12 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         warnings.simplefilter("always", InputNote)
         show_other = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            *where: Any,
+            **how: Any,
+        ) -> None:
             if issubclass(category, InputNote):
                 print(one_line(f"{name}: note: {message}"), file=sys.stderr)
             else:

@@ -157,7 +157,16 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     rows: dict[tuple[str, str], ResultRow] = {}
     with pool_of_processes(workers) as pool:
         with block_ctrl_c():
-            futures = {pool.submit(_learn, out / job[0], job[1], seed, config): job for job in jobs}
+            futures = {
+                pool.submit(
+                    _learn,
+                    out / job[0],
+                    job[1],
+                    seed,
+                    config,
+                ): job
+                for job in jobs
+            }
         _say(f"Training {len(jobs)} policies, {workers} at a time …")
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for future in as_completed(futures):
@@ -180,7 +189,12 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     return ordered
 
 
-def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow":
+def _learn(
+    folder: Path,
+    name: str,
+    seed: int,
+    config: DemoConfig,
+) -> "ResultRow":
     """Train and evaluate a method in the environment `folder.name`, in a worker process."""
     import torch
 

@@ -112,6 +112,6 @@ def _verify(path: Path) -> int:
         f"{path}: {len(record.files) - len(faults)} of {len(record.files)} files have the content "
         f"that was written ({size:,.1f} MB{unfinished})"
     )
-    print(*map(one_line, lines), sep="\n")
+    print("\n".join(map(one_line, lines)))
     refit = path / REFIT
     return len(faults) + (_verify(refit) if (refit / RunRecord.FILE).is_file() else 0)

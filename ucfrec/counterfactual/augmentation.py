@@ -185,8 +185,8 @@ def augment_episodes(
         mean = EffectsMean(item_rewards)
     sampled_episodes, sampled_steps = sample_steps(train, limit, seed)
     training = read_transitions(train, sampled_episodes, sampled_steps, item_rewards)
-    held_out_steps = sample_steps(validation, limit // 10, seed)
-    held_out = read_transitions(validation, *held_out_steps, item_rewards)
+    held_out_episodes, held_out_steps = sample_steps(validation, limit // 10, seed)
+    held_out = read_transitions(validation, held_out_episodes, held_out_steps, item_rewards)
     crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
@@ -263,7 +263,15 @@ def edit_states(
             s, a, r = factual.states, factual.actions, factual.rewards
             proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
-            factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
+            factual, z = (
+                replace(
+                    factual,
+                    states=s,
+                    actions=a,
+                    rewards=r,
+                ),
+                exact.abduct(s, a, r),
+            )
             proposals = proposed.double()
             passed = accept(exact, factual, z, proposals, epsilon_r * _LESS, rho_high * _LESS)
             moves.add(exact.moves(s[passed], proposals[passed]).cpu())
@@ -376,7 +384,11 @@ class MoveStatistics:
 
 
 def _report(
-    copies: int, proposals: int, moves: MoveReport, epsilon_r: float, crm_report: CRMReport
+    copies: int,
+    proposals: int,
+    moves: MoveReport,
+    epsilon_r: float,
+    crm_report: CRMReport,
 ) -> AugmentationReport:
     delta = crm_report.delta[_DELTA_LEVEL]
     bound = delta + epsilon_r
@@ -455,7 +467,11 @@ class ActionGenerator:
     """See `read_transitions`."""
 
     def propose(
-        self, episodes: IntArray, steps: IntArray, count: int, seed: int
+        self,
+        episodes: IntArray,
+        steps: IntArray,
+        count: int,
+        seed: int,
     ) -> tuple[AugmentedEpisodes, ActionReport]:
         """Draw `count` other actions, with replacement, at each of M steps of episodes (M,), and
         copy what passes; a draw of the logged action itself is not a proposal."""
@@ -469,10 +485,24 @@ class ActionGenerator:
             whether the model reproduces the logged reward."""
             drawn_at = np.arange(start, min(start + _ACTION_CHUNK, len(steps)))
             at = episodes[drawn_at], steps[drawn_at]
-            factual = read_transitions(view, *at, self.item_rewards).to(self.crm.device)
+            factual = read_transitions(view, at[0], at[1], self.item_rewards).to(self.crm.device)
             s, a, r = (v.double() for v in (factual.states, factual.actions, factual.rewards))
             z = exact.abduct(s, a, r)
-            reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
+            reproduced = (
+                (
+                    (
+                        exact.predict(
+                            s,
+                            a,
+                            z,
+                        )
+                        - r
+                    ).abs()
+                    <= self.epsilon_r
+                )
+                .cpu()
+                .numpy()
+            )
             labels = self.clusters.nearest(self.crm.normalise_states(factual.states).cpu()).numpy()
             rows = np.repeat(np.arange(len(drawn_at)), count)
             actions, drawable = self.support.draw(labels[rows], rng)
@@ -482,7 +512,15 @@ class ActionGenerator:
             changed = read_transitions(
                 view, at[0][rows], at[1][rows], self.item_rewards, actions
             ).actions
-            predicted = exact.predict(s[rows], changed.to(s), z[rows]).cpu().numpy()
+            predicted = (
+                exact.predict(
+                    s[rows],
+                    changed.to(s),
+                    z[rows],
+                )
+                .cpu()
+                .numpy()
+            )
             return drawn_at[rows], actions, predicted, reproduced[rows]
 
         chunks = map(predict, range(0, max(1, len(steps)), _ACTION_CHUNK))

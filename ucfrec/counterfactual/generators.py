@@ -75,7 +75,12 @@ class StateClusters:
     covariances: Tensor
 
     @classmethod
-    def of(cls, states: Tensor, most: int, seed: int) -> "StateClusters":
+    def of(
+        cls,
+        states: Tensor,
+        most: int,
+        seed: int,
+    ) -> "StateClusters":
         """At most `most` clusters of normalised states (M, S), on the CPU; of few, fewer."""
         # Imported here because it takes a second and 100 MB, and loading a policy does not need it.
         from sklearn.cluster import MiniBatchKMeans
@@ -124,7 +129,12 @@ class TangentGenerator:
     length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r.
     """
 
-    def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
+    def __init__(
+        self,
+        crm: CausalRewardModel,
+        clusters: StateClusters,
+        config: CSGConfig,
+    ) -> None:
         self._crm, self._config, self.band = crm, config, config.band
         matrices = clusters.covariances
         self._clusters = StateClusters(clusters.centres.to(crm.device), matrices.to(crm.device))
@@ -132,7 +142,12 @@ class TangentGenerator:
         self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
 
     @torch.no_grad()
-    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+    def propose(
+        self,
+        at: Transitions,
+        z: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
         """A state s_c (M, S) for each of M steps with abduced disturbances (M, latent_dim), such
         that f̂_r(s_c, a, z) is close to f̂_r(s, a, z). Draws by a `generator` on the CPU."""
         crm, states = self._crm, at.states
@@ -174,14 +189,24 @@ class CounterfactualStateGenerator(nn.Module):
         input_size = crm.state_mean.numel() + crm.action_mean.numel() + crm.config.latent_dim
         self.network = mlp(input_size, config.hidden, 3, crm.state_mean.numel())
 
-    def move(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+    def move(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        z: Tensor,
+    ) -> Tensor:
         """Moves Δ (M, S), in standard deviations of the states; 0 in dimensions that never vary."""
         (crm,) = self._crm
         move: Tensor = self.network(torch.cat([crm.given(states, actions), z], dim=-1))
         return move * (crm.state_std > 0)
 
     @torch.no_grad()
-    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+    def propose(
+        self,
+        at: Transitions,
+        z: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
         """See `TangentGenerator.propose`; deterministic."""
         return at.states + self._crm[0].state_std * self.move(at.states, at.actions, z)
 
@@ -192,7 +217,12 @@ class NoiseGenerator:
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
         self._std, self.band = crm.state_std, config.band
 
-    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+    def propose(
+        self,
+        at: Transitions,
+        z: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
         """See `TangentGenerator.propose`."""
         noise = torch.randn(at.states.shape, generator=generator).to(at.states.device)
         noise = noise * (self._std > 0)
@@ -205,7 +235,10 @@ Generator = TangentGenerator | CounterfactualStateGenerator | NoiseGenerator
 
 
 def state_clusters(
-    train: Transitions, crm: CausalRewardModel, config: CSGConfig, seed: int
+    train: Transitions,
+    crm: CausalRewardModel,
+    config: CSGConfig,
+    seed: int,
 ) -> StateClusters:
     """Clusters of the states of the steps that `make_generator` fits to, with the same seed."""
     states = train.states[_high_rewards(train, config, seed)].to(crm.device)
@@ -245,7 +278,11 @@ def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
 
 
 def _fit_faithful(
-    train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
+    train: Transitions,
+    crm: CausalRewardModel,
+    config: CSGConfig,
+    folder: Path,
+    seed: int,
 ) -> CounterfactualStateGenerator:
     rows = _high_rewards(train, config, seed)
     logged = [part[rows].to(crm.device) for part in (train.states, train.actions, train.rewards)]
@@ -290,7 +327,15 @@ def _fit_faithful(
 def _lengths(band: tuple[float, float], states: Tensor, generator: torch.Generator) -> Tensor:
     """(M, 1) lengths of moves from states (M, S), drawn from the band."""
     low, high = band
-    return (low + (high - low) * torch.rand(len(states), 1, generator=generator)).to(states.device)
+    return (
+        low
+        + (high - low)
+        * torch.rand(
+            len(states),
+            1,
+            generator=generator,
+        )
+    ).to(states.device)
 
 
 def _products(matrices: Tensor, vectors: Tensor, rows: list[int]) -> Tensor:

@@ -147,7 +147,11 @@ class CausalRewardModel(nn.Module):
     expected: nn.Sequential | EffectsMean
 
     def __init__(
-        self, state_size: int, action_size: int, config: CRMConfig, mean: EffectsMean | None = None
+        self,
+        state_size: int,
+        action_size: int,
+        config: CRMConfig,
+        mean: EffectsMean | None = None,
     ) -> None:
         """`mean` is E[r | s, a], whose actions have the size A = `action_size`; None for a network
         that is yet to be trained."""
@@ -176,18 +180,33 @@ class CausalRewardModel(nn.Module):
         mean, log_variance = self.encoder(torch.cat([inputs, surprise], dim=-1)).chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
-    def abduct(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
+    def abduct(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        rewards: Tensor,
+    ) -> Tensor:
         """z = μ_ϕ(s, a, r), the posterior mean (..., latent_dim) of Algorithms 3 to 5."""
         residual = self.residual(states, actions, rewards)
         return self.encode(self.given(states, actions), residual).mean
 
-    def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+    def predict(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        z: Tensor,
+    ) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
         disturbance = self._disturbance(self.given(states, actions), z)
         decoded = self.predict_expected(states, actions) + disturbance
         return self.reward_mean + self.reward_std * decoded
 
-    def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def elbo(
+        self,
+        inputs: Tensor,
+        residual: Tensor,
+        noise: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         """Log likelihood and KL of Eq. 2, each (...) in nats, at z = μ + σ·noise, with standard
         normal noise (..., latent_dim), of what `given` and `residual` return."""
         q = self.encode(inputs, residual)
@@ -197,7 +216,12 @@ class CausalRewardModel(nn.Module):
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
         return log_likelihood, q.kl.sum(-1)
 
-    def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
+    def residual(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        rewards: Tensor,
+    ) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
         return self.normalise_rewards(rewards) - self.predict_expected(states, actions)
 
@@ -238,7 +262,12 @@ class CausalRewardModel(nn.Module):
         return _normalise(rewards, self.reward_mean, self.reward_std)
 
 
-def mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
+def mlp(
+    inputs: int,
+    hidden: int,
+    layers: int,
+    outputs: int,
+) -> nn.Sequential:
     """A network of `layers` hidden layers of width `hidden` with ReLU, and a linear output."""
     blocks: list[nn.Module] = []
     for layer in range(layers):
@@ -357,7 +386,11 @@ def fit_crm(
 
 
 def _fit_mean(
-    model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
+    model: CausalRewardModel,
+    train: Transitions,
+    held_out: Transitions,
+    folder: Path,
+    seed: int,
 ) -> None:
     rows, held_out_rows = (
         (model.given(steps.states, steps.actions), model.normalise_rewards(steps.rewards))
@@ -392,7 +425,16 @@ def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> _Rows:
     s, a, r = transitions.states, transitions.actions, transitions.rewards
     parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
     inputs = torch.cat([model.given(s[part], a[part]) for part in parts])
-    return inputs, torch.cat([model.residual(s[part], a[part], r[part]) for part in parts])
+    return inputs, torch.cat(
+        [
+            model.residual(
+                s[part],
+                a[part],
+                r[part],
+            )
+            for part in parts
+        ]
+    )
 
 
 def _fit(

@@ -127,7 +127,10 @@ def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
 
 
 def find_measurements(
-    train: EpisodeStore, most: int, seed: int, dimensions: Sequence[int] | None = None
+    train: EpisodeStore,
+    most: int,
+    seed: int,
+    dimensions: Sequence[int] | None = None,
 ) -> dict[int, bool]:
     """Whether observation dimensions of training episodes measure the reward, by their errors on
     held-out episodes; None stands for all dimensions. At most `most` transitions are used.
@@ -150,7 +153,17 @@ def find_measurements(
             bar.update()
     # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return {
-        d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, seed)) for d in tested
+        d: d in leaks
+        and (
+            len(leaks) == 1
+            or _measures(
+                data,
+                d,
+                leaks - {d},
+                seed,
+            )
+        )
+        for d in tested
     }
 
 
@@ -158,7 +171,12 @@ class _Steps:
     """Standardised steps that have a successor: N logged observations (N, O), the `rest` of the
     state, the action and the next one (N, R), and rewards of the step and the next one (N, 2)."""
 
-    def __init__(self, view: EpisodeStore, most: int, seed: int) -> None:
+    def __init__(
+        self,
+        view: EpisodeStore,
+        most: int,
+        seed: int,
+    ) -> None:
         self.episodes, steps = steps_with_successor(view, most, seed)
         now = view.transitions(self.episodes, steps)
         then = view.transitions(self.episodes, steps + 1)
@@ -169,7 +187,12 @@ class _Steps:
         self.held_out = held_out_steps(view, self.episodes)
 
 
-def _measures(data: _Steps, dimension: int, without: Collection[int], seed: int) -> bool:
+def _measures(
+    data: _Steps,
+    dimension: int,
+    without: Collection[int],
+    seed: int,
+) -> bool:
     """Whether a dimension measures the reward; the columns `without` are excluded from the rest."""
     from sklearn.ensemble import HistGradientBoostingRegressor  # takes a second to import
 
@@ -199,7 +222,16 @@ def _measures(data: _Steps, dimension: int, without: Collection[int], seed: int)
     by_reward = explain(data.rewards)
     if not is_explained(by_reward):
         return False
-    inputs = np.column_stack([np.delete(data.columns, [dimension, *without], axis=1), data.rest])
+    inputs = np.column_stack(
+        [
+            np.delete(
+                data.columns,
+                [dimension, *without],
+                axis=1,
+            ),
+            data.rest,
+        ]
+    )
     by_rest = explain(inputs)
     if not is_explained(by_rest) or by_reward.mean() < by_rest.mean():
         return False

@@ -30,7 +30,12 @@ class Likeness(nn.Module):
     n_tags: Tensor
     directions: Tensor
 
-    def __init__(self, n_items: int, embedding_size: int, tags_per_item: int) -> None:
+    def __init__(
+        self,
+        n_items: int,
+        embedding_size: int,
+        tags_per_item: int,
+    ) -> None:
         super().__init__()
         self.register_buffer("tags", torch.full((n_items, tags_per_item), -1))
         self.register_buffer("n_tags", torch.zeros((), dtype=torch.int64))
@@ -85,7 +90,12 @@ class Likeness(nn.Module):
         empty = spread.new_zeros(items.shape[0], padding + 1)
         return empty.scatter_add(1, places, spread)[:, :-1]
 
-    def added_to(self, values: Tensor, profile: Tensor, items: Tensor | None = None) -> Tensor:
+    def added_to(
+        self,
+        values: Tensor,
+        profile: Tensor,
+        items: Tensor | None = None,
+    ) -> Tensor:
         """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`
         (L,) int64; None for all items."""
         # Scores are float32, whatever the network computes in.
@@ -118,7 +128,14 @@ class Likeness(nn.Module):
             return flat.view(shape)
         tags = self.tags[items]
         places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
-        gathered = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
+        gathered = nn.functional.pad(profile, (0, 1)).gather(
+            2,
+            places.expand(
+                -1,
+                shape[1],
+                -1,
+            ),
+        )
         return gathered.view((*shape, tags.shape[2])).sum(3)
 
     def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,7 +183,12 @@ class ExposureTerm(nn.Module):
     reward_low: Tensor
     reward_high: Tensor
 
-    def __init__(self, lags: int, knots: int, likeness: Likeness) -> None:
+    def __init__(
+        self,
+        lags: int,
+        knots: int,
+        likeness: Likeness,
+    ) -> None:
         super().__init__()
         self.likeness = likeness
         self.lags = lags
@@ -206,7 +228,12 @@ class ExposureTerm(nn.Module):
         liked = ((exposed.rewards - self.reward_low) / span).clamp(0, 1)
         return repeated + repeated_liked * liked, alike + alike_liked * liked
 
-    def added_to(self, logits: Tensor, exposed: Exposed, items: Tensor | None = None) -> Tensor:
+    def added_to(
+        self,
+        logits: Tensor,
+        exposed: Exposed,
+        items: Tensor | None = None,
+    ) -> Tensor:
         """Logits (M, L) with the term, which are overwritten, of `items` (L,) int64, ascending,
         each once; None for all items."""
         repeated, alike = self.weights(exposed)

@@ -166,6 +166,11 @@ class StoreRecord(Record):
             )
         return super().of(value, path)
 
-    def _bad(self, folder: Path, name: str, value: int) -> InputError:
+    def _bad(
+        self,
+        folder: Path,
+        name: str,
+        value: int,
+    ) -> InputError:
         path = folder / self.FILE
         return InputError(f"{path} is damaged: its {name} is {value}; {self.REMEDY}")

@@ -92,7 +92,11 @@ class ItemStates:
         items = F.pad(self.embeddings.float(), (0, 0, 0, 1))
         object.__setattr__(self, "_items", items)
         object.__setattr__(self, "embeddings", items[:-1])
-        object.__setattr__(self, "_users", F.pad(self.user_features.float(), (0, 0, 0, 1)))
+        object.__setattr__(
+            self,
+            "_users",
+            F.pad(self.user_features.float(), (0, 0, 0, 1)),
+        )
         decays = [self.decay**lag for lag in reversed(range(self.window))]
         object.__setattr__(self, "_decays", torch.tensor(decays))
 
@@ -102,7 +106,12 @@ class ItemStates:
         return 3 * self.embeddings.shape[1] + 2 + self.user_features.shape[1]
 
     def build(
-        self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
+        self,
+        items: Tensor,
+        rewards: Tensor,
+        steps: Tensor,
+        users: Tensor,
+        observations: Tensor,
     ) -> Tensor:
         """States (B, K, S) just before K consecutive steps of each of B sessions.
 
@@ -124,7 +133,14 @@ class ItemStates:
         padded = F.pad(embedded, (0, 1), value=1.0)
         sums = padded.new_zeros(2, batch, length, padded.shape[-1])
         weights = counts.unfold(2, self.window, 1) * self._decays  # type: ignore[attr-defined]
-        of_lags = weights.unsqueeze(-1).unbind(3), padded.unfold(1, self.window, 1).unbind(-1)
+        of_lags = (
+            weights.unsqueeze(-1).unbind(3),
+            padded.unfold(
+                1,
+                self.window,
+                1,
+            ).unbind(-1),
+        )
         # Floating-point sums depend on their order: the most recent item comes first.
         for weight, vector in reversed(list(zip(*of_lags, strict=True))):
             sums = sums.add_(weight * vector)

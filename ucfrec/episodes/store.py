@@ -282,7 +282,12 @@ class UserRows:
     """(N,) row of each later step."""
 
     @classmethod
-    def of(cls, later: EpisodeStore, users: Array, earlier: EpisodeStore | None) -> "UserRows":
+    def of(
+        cls,
+        later: EpisodeStore,
+        users: Array,
+        earlier: EpisodeStore | None,
+    ) -> "UserRows":
         """Collect the rows.
 
         Args:
@@ -404,7 +409,12 @@ def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray
 class _JoinedRows:
     """Values of rows that lie in two stores, as an array is indexed."""
 
-    def __init__(self, rows: UserRows, name: str, source: IntArray) -> None:
+    def __init__(
+        self,
+        rows: UserRows,
+        name: str,
+        source: IntArray,
+    ) -> None:
         self._rows, self._name, self._source = rows, name, source
 
     def __len__(self) -> int:

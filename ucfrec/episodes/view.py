@@ -85,7 +85,12 @@ class Columns:
         """(E,) number of steps at the beginning of each episode that are known but do not count;
         None for none."""
 
-    def replace(self, name: str, column: StepColumn, **changes: Any) -> "Columns":
+    def replace(
+        self,
+        name: str,
+        column: StepColumn,
+        **changes: Any,
+    ) -> "Columns":
         """A copy with another step column and other attributes; files stay as they are."""
         copied = copy(self)
         vars(copied).update(changes, _steps={**self._steps, name: column})
@@ -318,7 +323,12 @@ class EpisodeView:
         episodes = np.arange(self.n_episodes)
         return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
 
-    def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
+    def step_values(
+        self,
+        name: str,
+        episodes: IntArray,
+        steps: IntArray,
+    ) -> Array:
         """Values of a step column at steps (from 0) of episodes, two arrays whose shapes broadcast;
         of this shape, followed by the size of a vector.
 
@@ -379,7 +389,12 @@ class EpisodeView:
         """Actions as vectors (..., A): the embeddings of items (...); vectors are unchanged."""
         return self.item_states.embeddings[actions] if self.has_items else actions
 
-    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
+    def windows(
+        self,
+        episodes: IntArray,
+        ends: IntArray,
+        length: int,
+    ) -> Windows:
         """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
 
         Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
@@ -422,7 +437,12 @@ class EpisodeView:
             last=is_last,
         )
 
-    def _require_steps(self, episodes: IntArray, ends: IntArray, length: int) -> None:
+    def _require_steps(
+        self,
+        episodes: IntArray,
+        ends: IntArray,
+        length: int,
+    ) -> None:
         if episodes.ndim != 1 or episodes.shape != ends.shape or length < 1:
             raise InputError(
                 f"windows of {length} steps, episodes of shape {episodes.shape} and steps of shape "

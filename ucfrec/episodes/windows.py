@@ -132,14 +132,18 @@ class Shown(NamedTuple):
 
     @classmethod
     def before(
-        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, length: int
+        cls,
+        store: "EpisodeStore",
+        episodes: IntArray,
+        steps: IntArray,
+        length: int,
     ) -> "Shown":
         """What sessions (B,) of a store of items showed in the N = `length` steps before steps
         (B,). An unknown item (−1) counts as the first."""
         earlier = steps[:, None] - np.arange(1, length + 1)
-        missing, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
-        items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
-        rewards = store.step_values(schema.REWARD, *places)
+        missing, owner, earlier = earlier < 0, episodes[:, None], np.maximum(earlier, 0)
+        items = store.step_values(schema.ITEM, owner, earlier).clip(min=0).astype(np.int64)
+        rewards = store.step_values(schema.REWARD, owner, earlier)
         return cls(
             torch.from_numpy(np.where(missing, -1, items)),
             torch.from_numpy(np.where(missing, np.float32(0), rewards)),
@@ -154,7 +158,14 @@ class Shown(NamedTuple):
         recent, pad = self.latest(steps), nn.functional.pad
         if not (missing := steps - recent.items.shape[1]):
             return recent
-        return Shown(pad(recent.items, (0, missing), value=-1), pad(recent.rewards, (0, missing)))
+        return Shown(
+            pad(
+                recent.items,
+                (0, missing),
+                value=-1,
+            ),
+            pad(recent.rewards, (0, missing)),
+        )
 
     def latest(self, steps: int) -> "Shown":
         """What was shown in the latest `steps` of these."""
@@ -173,7 +184,12 @@ class Exposed:
     """(M,) returns-to-go in units of the policy's return scale."""
 
     @classmethod
-    def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
+    def before(
+        cls,
+        windows: Windows,
+        lags: int,
+        steps: Tensor | None = None,
+    ) -> "Exposed":
         """For every step t of B windows of K steps, or those in a mask (B, K): steps t − 1 to
         t − `lags` of the same window."""
         items = windows.actions.masked_fill(~windows.mask, -1)
@@ -187,7 +203,7 @@ class Exposed:
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
         """For the last step of B windows, as `before`, (B, lags)."""
         recent = Shown.before_last(windows.last(lags + 1)).padded(lags)
-        return cls(*recent, windows.returns_to_go[:, -1])
+        return cls(recent.items, recent.rewards, windows.returns_to_go[:, -1])
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
@@ -218,7 +234,12 @@ class Sessions(_Rows):
     """(B, K, S) float32 of the last K steps or more, where they are known; None to build them."""
 
     @classmethod
-    def begun(cls, count: int, length: int, vector_size: int = 0) -> "Sessions":
+    def begun(
+        cls,
+        count: int,
+        length: int,
+        vector_size: int = 0,
+    ) -> "Sessions":
         """B = `count` sessions of unknown users without a step; of items, if A is 0."""
         actions = torch.full((count, length), -1)
         if vector_size:
@@ -258,7 +279,12 @@ class Sessions(_Rows):
 
     @classmethod
     def from_store(
-        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, context: int, length: int
+        cls,
+        store: "EpisodeStore",
+        episodes: IntArray,
+        steps: IntArray,
+        context: int,
+        length: int,
     ) -> "Sessions":
         """What was known before steps (B,) of sessions (B,) of a store of items.
 
@@ -336,7 +362,12 @@ class Sessions(_Rows):
             nn.functional.pad(self.rewards[:, first:], (0, 1)),
         )
 
-    def _build_states(self, states: ItemStates, steps: Tensor, observations: Tensor) -> Tensor:
+    def _build_states(
+        self,
+        states: ItemStates,
+        steps: Tensor,
+        observations: Tensor,
+    ) -> Tensor:
         """States (B, K, S) of steps (B, K), the last ones, with observations (B, K, O)."""
         reach = steps.shape[1] - 1 + states.window
         items, rewards = self.actions[:, -reach:], self.rewards[:, -reach:]
@@ -480,7 +511,12 @@ class TrainingEpisodes:
         episodes = np.searchsorted(self._ends, numbers, side="right")
         return episodes, numbers - self._begins[episodes]
 
-    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
+    def windows(
+        self,
+        episodes: IntArray,
+        ends: IntArray,
+        length: int,
+    ) -> Windows:
         """Windows as `EpisodeStore.windows`; those of action copies end with their last step."""
         windows, augmented = self._sources.windows(episodes, ends, length), self._augmented
         steps = ends[:, None] + np.arange(1 - length, 1)

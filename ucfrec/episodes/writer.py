@@ -28,7 +28,12 @@ class StoreWriter:
     appears complete or not at all.
     """
 
-    def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        shard_steps: int = 2**24,
+        first_shard: int = 0,
+    ) -> None:
         """A shard ends with the first episode that brings it to `shard_steps` steps."""
         self._folder, self._shard_steps = folder, shard_steps
         self._hashes: dict[str, Any] = {}
@@ -40,7 +45,10 @@ class StoreWriter:
         self._steps_in_shard, self._shards = 0, first_shard
 
     def append(
-        self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
+        self,
+        steps: Mapping[str, Array],
+        first: BoolArray,
+        episodes: Mapping[str, Array],
     ) -> None:
         """Append M steps.
 
@@ -116,7 +124,10 @@ class StoreWriter:
         self._steps_in_shard = 0
 
     def finish(
-        self, reward: str, source: Mapping[str, Any], ids: Mapping[str, list[Any]] | None = None
+        self,
+        reward: str,
+        source: Mapping[str, Any],
+        ids: Mapping[str, list[Any]] | None = None,
     ) -> StoreRecord:
         """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
@@ -159,7 +170,10 @@ class StoreWriter:
 
 
 def reward_bit(
-    store: "EpisodeStore", flip: float = 0.0, seed: int = 0, early: bool = False
+    store: "EpisodeStore",
+    flip: float = 0.0,
+    seed: int = 0,
+    early: bool = False,
 ) -> Float32Array:
     """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4),
     (n_steps,) float32, 0 or 1, in the order of `all_steps`.
@@ -190,7 +204,10 @@ def reward_bit(
 
 
 def write_observations(
-    store: "EpisodeStore", out: Path, observations: Float32Array, source: Mapping[str, Any]
+    store: "EpisodeStore",
+    out: Path,
+    observations: Float32Array,
+    source: Mapping[str, Any],
 ) -> "EpisodeStore":
     """Write a copy of `store` with other observations, atomically.
 

@@ -77,7 +77,12 @@ def collect(
 class _SessionLog:
     """Writes steps to a Parquet file, one row group at a time."""
 
-    def __init__(self, path: Path, env: VectorEnv[Any, Any, Any], feedback: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        env: VectorEnv[Any, Any, Any],
+        feedback: str,
+    ) -> None:
         self._path, self._feedback = path, feedback
         discrete = isinstance(env.single_action_space, spaces.Discrete)
         self._items = environment_items(env) if discrete else None
@@ -137,7 +142,12 @@ class _SessionLog:
         return columns
 
 
-def collect_store(environment: Environment, folder: Path, sessions: int, seed: int) -> Path:
+def collect_store(
+    environment: Environment,
+    folder: Path,
+    sessions: int,
+    seed: int,
+) -> Path:
     """Collect logs of the `logging_behavior` in `folder/logs` and prepare `folder/store`; existing
     folders are reused."""
     logs, store = folder / "logs", folder / "store"

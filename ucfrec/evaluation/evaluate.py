@@ -38,7 +38,10 @@ Recommended = Sequence[tuple[IntArray, IntArray]]
 
 @random_state_kept()
 def evaluate_behavior(
-    environment: Environment, behavior: str, episodes: int, seed: int
+    environment: Environment,
+    behavior: str,
+    episodes: int,
+    seed: int,
 ) -> ResultRow:
     """Result row of an environment's built-in policy (`random`, `optimal`, …); InputError if it has
     none of that name. The seed is that of the environments and of the policy."""

@@ -50,7 +50,12 @@ class GymnasiumEnvironment(SyncVectorEnv):
             gives only some sessions a `user_id`.
     """
 
-    def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int,
+        observe: Sequence[str] = (),
+    ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}; at least one session must be simulated")
         make = partial(_Session, env_id, tuple(observe))
@@ -93,7 +98,11 @@ class GymnasiumCatalog(GymnasiumEnvironment):
     """A `GymnasiumEnvironment` of items, not vectors, whose features `items` reads."""
 
     def __init__(
-        self, env_id: str, num_envs: int, items: Items, observe: Sequence[str] = ()
+        self,
+        env_id: str,
+        num_envs: int,
+        items: Items,
+        observe: Sequence[str] = (),
     ) -> None:
         super().__init__(env_id, num_envs, observe)
         space = self.single_action_space
@@ -175,7 +184,10 @@ def _actions(
 
 
 def _select_observed(
-    space: spaces.Space[Any], keys: tuple[str, ...], vectors: bool, env_id: str
+    space: spaces.Space[Any],
+    keys: tuple[str, ...],
+    vectors: bool,
+    env_id: str,
 ) -> _Observed:
     entries = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
     unknown = [key for key in keys if key not in entries]

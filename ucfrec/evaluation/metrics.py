@@ -39,7 +39,18 @@ def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> 
 
 def precision(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
     """Share of `k` places that hold a relevant item, mean over users."""
-    return float((_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].count() / k).mean())
+    return float(
+        (
+            _hits(
+                recommended,
+                relevant,
+                k,
+            )
+            .groupby(USER_ID)[_RANK]
+            .count()
+            / k
+        ).mean()
+    )
 
 
 def recall(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
@@ -64,7 +75,10 @@ def mean_average_precision(recommended: pd.DataFrame, relevant: pd.DataFrame, k:
 
 
 def ndcg(
-    recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10, achievable: bool = False
+    recommended: pd.DataFrame,
+    relevant: pd.DataFrame,
+    k: int = 10,
+    achievable: bool = False,
 ) -> float:
     """Σ 1 / log2(1 + rank) over a user's relevant items among the `k` best, divided by the ideal;
     mean over users.
@@ -234,7 +248,10 @@ def _kind(ids: pd.Series) -> str:
 
 
 def _require(
-    frame: pd.DataFrame, name: str, columns: Sequence[str], beside: pd.DataFrame | None = None
+    frame: pd.DataFrame,
+    name: str,
+    columns: Sequence[str],
+    beside: pd.DataFrame | None = None,
 ) -> pd.DataFrame:
     """The columns of a frame, without categories, once it has rows and is found to have columns of
     the kinds of those of `recommended`, if given."""

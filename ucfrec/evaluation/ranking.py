@@ -265,7 +265,10 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
 
 
 def compare(
-    period: Period, ranked: Mapping[str, Ranked], reference: str, seed: int
+    period: Period,
+    ranked: Mapping[str, Ranked],
+    reference: str,
+    seed: int,
 ) -> dict[str, dict[str, Any]]:
     """By ranker (name: results), the value of each measure; `intervals`, the ends of their 95%
     intervals (percentile bootstrap over users); `differences` from `reference`, each with the ends
@@ -277,7 +280,7 @@ def compare(
     above, below = np.ascontiguousarray(np.transpose(measured, (2, 3, 0, 1)))
     users = len(above)
     ratios = resampled_ratios(above.reshape(users, -1), below.reshape(users, -1), seed)
-    resampled = ratios.reshape(-1, *above.shape[1:])
+    resampled = ratios.reshape((-1, *above.shape[1:]))
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
     column = list(ranked).index(reference)

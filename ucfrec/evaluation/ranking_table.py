@@ -91,7 +91,10 @@ def neighbour_ranker(train: EpisodeStore, tie_break: Tensor) -> Ranker:
 
 
 def factor_rankers(
-    train: EpisodeStore, tie_break: Tensor, seed: int, liked_of: LikedOf
+    train: EpisodeStore,
+    tie_break: Tensor,
+    seed: int,
+    liked_of: LikedOf,
 ) -> Iterator[tuple[str, Ranker]]:
     """Rank items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
     and BPR (Rendle et al., 2009); needs the package `implicit`."""
@@ -255,7 +258,10 @@ def ranking_rows(
 
 
 def _row(
-    name: str, measured: Mapping[str, Any], policy: PolicyRanker | None, shared: Mapping[str, Any]
+    name: str,
+    measured: Mapping[str, Any],
+    policy: PolicyRanker | None,
+    shared: Mapping[str, Any],
 ) -> ResultRow:
     """The row of one ranker; `policy` is the ranker if it is a trained policy."""
     row = ResultRow(method=name, policy=name, **shared)

@@ -101,7 +101,10 @@ class Environment:
         return self.name + observe + features
 
     def start(
-        self, sessions: int, behavior: str, seed: int
+        self,
+        sessions: int,
+        behavior: str,
+        seed: int,
     ) -> "tuple[VectorEnv[Any, Any, Any], Actor]":
         """Parallel sessions and a built-in policy for them; InputError if there is none of that
         name."""

@@ -59,7 +59,11 @@ class Explained:
 
 
 def explain(
-    trained: TrainedPolicy, rule: DecisionRule, user: Histories, k: int, filter_seen: bool
+    trained: TrainedPolicy,
+    rule: DecisionRule,
+    user: Histories,
+    k: int,
+    filter_seen: bool,
 ) -> Explained:
     """The recommendations of `ucfrec recommend` for one user, with their reasons.
 
@@ -79,7 +83,13 @@ def explain(
             ids.tolist(), trained.items.numbers(ids), frame[schema.PROPENSITY], strict=True
         )
     ]
-    rows = list(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
+    rows = list(
+        zip(
+            user.item_ids[::-1].tolist(),
+            user.rewards[::-1].tolist(),
+            strict=True,
+        )
+    )
     excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
     return Explained(rows, cards, excluded)
 

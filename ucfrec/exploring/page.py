@@ -205,7 +205,11 @@ def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRul
 
 
 def _read_number(
-    fields: Mapping[str, str], name: str, low: float, high: float, default: float = 0.0
+    fields: Mapping[str, str],
+    name: str,
+    low: float,
+    high: float,
+    default: float = 0.0,
 ) -> float:
     text = fields.get(name, "")
     try:

@@ -255,7 +255,12 @@ def require_file(path: Path, remedy: str) -> None:
         raise InputError(f"{path} {what}; {remedy}")
 
 
-def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
+def _parse(
+    path: Path,
+    largest: int,
+    kind: str,
+    parse: Callable[[str], Any],
+) -> Any:
     """Read a text file of at most so many bytes."""
     require_file(path, "check the path")
     if path.stat().st_size > largest:

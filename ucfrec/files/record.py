@@ -149,7 +149,12 @@ class Record(Entry):
         write_json(folder / self.FILE, self.model_dump(), seal=True)
         return self
 
-    def require(self, folder: Path, *names: str, small: int = -1) -> None:
+    def require(
+        self,
+        folder: Path,
+        *names: str,
+        small: int = -1,
+    ) -> None:
         """Check size and content of `names` that are listed; without any, sizes, and small files.
 
         Raises:
@@ -173,7 +178,12 @@ class Record(Entry):
         """Files of the folder that are not listed, without locks and scratch."""
         return sorted(set(_names(folder)) - self.files.keys())
 
-    def _find_fault(self, folder: Path, name: str, content: bool = True) -> str:
+    def _find_fault(
+        self,
+        folder: Path,
+        name: str,
+        content: bool = True,
+    ) -> str:
         path, (stated, checksum) = folder / name, self.files[name]
         try:
             if not path.is_file():

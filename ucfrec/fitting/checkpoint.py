@@ -86,7 +86,10 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 
 
 def load_weights(
-    path: Path, module: nn.Module, tensors: Mapping[str, Tensor], assign: bool = False
+    path: Path,
+    module: nn.Module,
+    tensors: Mapping[str, Tensor],
+    assign: bool = False,
 ) -> None:
     """Load `tensors`, which were read from `path`, into `module`; copied unless `assign`.
 

@@ -104,7 +104,13 @@ def joint_means(means: Mapping[str, float], count: float) -> dict[str, float]:
     values = torch.tensor([*(mean * count for mean in means.values()), count], dtype=torch.float64)
     if processes() > 1:
         distributed.all_reduce(values)
-    return dict(zip(means, (values[:-1] / values[-1]).tolist(), strict=True))
+    return dict(
+        zip(
+            means,
+            (values[:-1] / values[-1]).tolist(),
+            strict=True,
+        )
+    )
 
 
 def joint_moments(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -139,7 +145,14 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
 def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     """The sum over processes of sparse gradients times their weights."""
     rows, values = gradient.indices()[0], gradient.values() * weight
-    sizes = [torch.zeros(1, dtype=torch.int64, device=rows.device) for _ in range(processes())]
+    sizes = [
+        torch.zeros(
+            1,
+            dtype=torch.int64,
+            device=rows.device,
+        )
+        for _ in range(processes())
+    ]
     distributed.all_gather(sizes, torch.tensor([len(rows)], device=rows.device))
     counts = [int(size) for size in sizes]
     # Messages have to be of one size, that of the largest.
@@ -149,7 +162,18 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
         padded[: len(part)] = part
         parts = [torch.empty_like(padded) for _ in range(processes())]
         distributed.all_gather(parts, padded)
-        joined.append(torch.cat([part[:n] for part, n in zip(parts, counts, strict=True)]))
+        joined.append(
+            torch.cat(
+                [
+                    part[:n]
+                    for part, n in zip(
+                        parts,
+                        counts,
+                        strict=True,
+                    )
+                ]
+            )
+        )
     return torch.sparse_coo_tensor(
         joined[0].unsqueeze(0), joined[1], gradient.shape, check_invariants=False
     )

@@ -189,7 +189,13 @@ def fit(
 class _Training:
     """What a training changes, and the files that it is saved to and resumed from."""
 
-    def __init__(self, module: nn.Module, config: LoopConfig, folder: Path, describe: str) -> None:
+    def __init__(
+        self,
+        module: nn.Module,
+        config: LoopConfig,
+        folder: Path,
+        describe: str,
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._last, self._best = folder / "last.safetensors", folder / "best.safetensors"
         self._module, self._config, self._describe = module, config, describe
@@ -229,7 +235,12 @@ class _Training:
             tensors, counters = tensors | means, counters | steps
         save_tensors(self._last, tensors, counters)
 
-    def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
+    def descend(
+        self,
+        value: Tensor,
+        step: int,
+        count: float | None,
+    ) -> Tensor:
         """One optimizer step on the loss `value`, the mean of `count` rows of all that processes
         have; returns the gradient norm before clipping."""
         config = self._config
@@ -251,7 +262,10 @@ class _Training:
         return norm
 
     def validate(
-        self, step: int, logged: Mapping[str, float], validate: Callable[[], float] | None
+        self,
+        step: int,
+        logged: Mapping[str, float],
+        validate: Callable[[], float] | None,
     ) -> dict[str, float]:
         """Save the weights if their validation loss, which is returned, is the lowest so far."""
         self._require_finite("loss", logged["loss"], step)
@@ -272,7 +286,12 @@ class _Training:
                 save_tensors(self._best, self._module.state_dict(), {"step": step, **losses})
         return losses
 
-    def _require_finite(self, quantity: str, value: float, step: int) -> None:
+    def _require_finite(
+        self,
+        quantity: str,
+        value: float,
+        step: int,
+    ) -> None:
         if not math.isfinite(value):
             raise InputError(
                 f"{self._describe}: the {quantity} is {value} at step {step}; lower the learning "
@@ -315,7 +334,12 @@ class RowAdamW(torch.optim.AdamW):
                     parameter.grad = None
         return super().step(closure)
 
-    def _update_rows(self, table: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+    def _update_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        group: dict[str, Any],
+    ) -> None:
         rows, values = gradient.indices()[0], gradient.values()
         state = self.state[table]
         if not state:
@@ -365,7 +389,12 @@ class WeightAverage:
     resumed training ends with the bits of an uninterrupted one.
     """
 
-    def __init__(self, module: nn.Module, decay: float, start: int = 0) -> None:
+    def __init__(
+        self,
+        module: nn.Module,
+        decay: float,
+        start: int = 0,
+    ) -> None:
         """`decay` is the largest d; the weights of the first `start` steps are not averaged."""
         self._decay, self._start, self._step = decay, start, 0
         self._log = 0.0  # Σ log d of the steps so far

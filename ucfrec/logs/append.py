@@ -115,7 +115,15 @@ def append_logs(
         memory_limit=options.memory_limit,
         gap_minutes=(old.source.session_gap_ms or 1_800_000) / 60_000,
     )
-    late = _rows_after(end, store, shards) if any((s.times > end).any() for s in shards) else None
+    late = (
+        _rows_after(
+            end,
+            store,
+            shards,
+        )
+        if any((s.times > end).any() for s in shards)
+        else None
+    )
     with (
         atomic_folder(out) as folder,
         read_log(files, mapping, reading, out.parent, store, grows=True, held=late) as log,
@@ -159,7 +167,12 @@ def _rows_after(end: int, store: Path, shards: Sequence["_Shard"]) -> pa.Table:
     return pa.table(columns)
 
 
-def _note_late(log: TypedLog, store: Path, late: pa.Table, end: int) -> None:
+def _note_late(
+    log: TypedLog,
+    store: Path,
+    late: pa.Table,
+    end: int,
+) -> None:
     """Warn of rows of a store after its end, if new rows come before some of them."""
     last = late[schema.TIMESTAMP].to_numpy().max()
     (count,) = log.one(
@@ -197,7 +210,10 @@ def _describe_late(late: pa.Table, end: int) -> str:
 
 
 def _describe_inputs(
-    old: StoreRecord, files: Sequence[Path], mapping: LogMapping, options: AppendOptions
+    old: StoreRecord,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    options: AppendOptions,
 ) -> dict[str, Any]:
     """What the grown store depends on, to know it again; the keys name it where it differs."""
     tables = (*mapping.item_features, *mapping.user_features)
@@ -224,7 +240,10 @@ def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
 
 
 def _survey_ids(
-    log: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord
+    log: PreparedLog,
+    mapping: LogMapping,
+    store: Path,
+    old: StoreRecord,
 ) -> dict[str, int]:
     """How many ids are new, and the steps that have them, with warnings of unusual ones."""
     typed, counts = log.rows.log, {}
@@ -334,7 +353,10 @@ def _move_train_counts(log: TypedLog, shards: Sequence[_Shard]) -> None:
 
 
 def _copy_shard(
-    shard: _Shard, target: Path, old: StoreRecord, added: Sequence[str]
+    shard: _Shard,
+    target: Path,
+    old: StoreRecord,
+    added: Sequence[str],
 ) -> dict[str, tuple[int, str]]:
     """Link or write the files of an old shard, and columns `added`; returns known checksums."""
     target.mkdir()

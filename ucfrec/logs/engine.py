@@ -174,7 +174,12 @@ class Bound(NamedTuple):
     """Whether it is the name of a column."""
 
 
-def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, expression: str) -> Bound:
+def bind(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    what: str,
+    expression: str,
+) -> Bound:
     """Resolve a column name (in any case) or a scalar SQL expression against a table's columns.
 
     An expression that computes with truth values, such as `is_click + 2 * is_like`, takes them as 0
@@ -221,7 +226,13 @@ def _missing(table: Table, what: str, name: str) -> InputError:
     return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
 
 
-def wrong_type(table: Table, what: str, expression: str, kind: str, remedy: str) -> InputError:
+def wrong_type(
+    table: Table,
+    what: str,
+    expression: str,
+    kind: str,
+    remedy: str,
+) -> InputError:
     """Error for a column of an unsupported type."""
     return InputError(f"{table.files[0]}: {what} ({expression}) is {kind}; {remedy}")
 
@@ -276,7 +287,10 @@ def _find_fault(
 
 
 def settle_mapping(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], mapping: LogMapping, reward: str
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[Table],
+    mapping: LogMapping,
+    reward: str,
 ) -> tuple[LogMapping, str]:
     """The mapping and the reward of a log, with the names of a run's training log or plain ones.
 
@@ -344,7 +358,10 @@ def _read_names(connection: duckdb.DuckDBPyConnection, expression: str) -> set[s
 
 
 def text_of_column(
-    connection: duckdb.DuckDBPyConnection, table: Table, mapping: LogMapping, name: str
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    mapping: LogMapping,
+    name: str,
 ) -> str:
     """The column or expression that a log column is in a table. Those of a log of `join` have the
     names of `join`, unless what is mapped reads these, such as `timestamp + position`."""

@@ -131,7 +131,12 @@ class NotScalarError(Exception):
     """A text is not an allowed scalar expression; the message says why."""
 
 
-def refusal(what: str, expression: str, source: str, reason: str) -> InputError:
+def refusal(
+    what: str,
+    expression: str,
+    source: str,
+    reason: str,
+) -> InputError:
     """One-line error for an expression that cannot be used, `what` for (e.g. "for the reward"),
     over the columns of a file or table, `source`."""
     origin = f"{expression.origin}: " if isinstance(expression, Expression) else ""

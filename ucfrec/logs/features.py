@@ -54,7 +54,10 @@ _Types = dict[str, tuple[str, Path]]
 
 
 def load_features(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[FeatureTable], kind: str, id_type: str
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[FeatureTable],
+    kind: str,
+    id_type: str,
 ) -> list[str]:
     """Read feature tables into DuckDB tables, whose names are returned, with columns `id`, `f0`, ….
 
@@ -286,7 +289,10 @@ def encode_ids(
 
 
 def encode_features(
-    connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
+    connection: duckdb.DuckDBPyConnection,
+    names: Sequence[str],
+    ids: str,
+    id_column: str,
 ) -> "sparse.csr_matrix | None":
     """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`; None if
     there are none.
@@ -319,7 +325,10 @@ def encode_features(
 
 
 def _encode_numbers(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, vector: str
+    connection: duckdb.DuckDBPyConnection,
+    joined: str,
+    column: str,
+    vector: str,
 ) -> tuple[Array, IntArray, IntArray, int]:
     """Entries of a matrix: values, rows and columns, of which there are so many."""
     sizes = connection.sql(

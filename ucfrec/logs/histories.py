@@ -196,7 +196,10 @@ def frame_histories(
 
 
 def log_table(
-    frame: "pd.DataFrame", name: str, mapping: LogMapping, reward: str | None
+    frame: "pd.DataFrame",
+    name: str,
+    mapping: LogMapping,
+    reward: str | None,
 ) -> pa.Table:
     """Convert a data frame to Arrow without the columns that it cannot hold.
 
@@ -267,7 +270,10 @@ def _list_types(kind: pa.DataType) -> Iterator[pa.DataType]:
 
 
 def _read_users(
-    tables: LogTables, last: int, duplicates: str, folder: Path | None
+    tables: LogTables,
+    last: int,
+    duplicates: str,
+    folder: Path | None,
 ) -> Iterator[Histories]:
     """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
     log = open_log(tables)

@@ -65,7 +65,12 @@ def read_training_steps(folder: Path, shards: Iterable[int]) -> Iterator[dict[st
             begin = end
 
 
-def write_item_states(folder: Path, scratch: Path, encoded: EncodedFeatures, size: int) -> None:
+def write_item_states(
+    folder: Path,
+    scratch: Path,
+    encoded: EncodedFeatures,
+    size: int,
+) -> None:
     """Learn the item embeddings (at most `size` dimensions) and user features of the store at
     `folder` and write them there. Raises InputError if all rewards of the training split are equal.
     """
@@ -107,7 +112,12 @@ class Exposure:
         self._rows = SparseRows(path, len(self.trained))
         self._by_item = np.zeros(len(self.trained))
 
-    def add(self, users: IntArray, items: IntArray, weights: Float64Array) -> None:
+    def add(
+        self,
+        users: IntArray,
+        items: IntArray,
+        weights: Float64Array,
+    ) -> None:
         """Add steps (M,); those of one user follow each other, in one call, and weights (above 0)
         of one user and item are added up."""
         rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
@@ -164,7 +174,10 @@ def item_embeddings(
 
 
 def predict_from_features(
-    features: sparse.csr_matrix, trained: IntArray, cooccurrence: Float64Array, counts: IntArray
+    features: sparse.csr_matrix,
+    trained: IntArray,
+    cooccurrence: Float64Array,
+    counts: IntArray,
 ) -> Float64Array:
     """(n_items, size) co-occurrence part predicted from features, by ridge regression."""
     axes = _axes(features[trained], CONTENT_RANK)
@@ -299,7 +312,10 @@ def _there_and_back(
 
 
 def write_grown_states(
-    store: Path, folder: Path, new_shards: Iterable[int], encoded: EncodedFeatures
+    store: Path,
+    folder: Path,
+    new_shards: Iterable[int],
+    encoded: EncodedFeatures,
 ) -> None:
     """Write the item states of the store at `folder`, grown from `store` by `new_shards`.
 
@@ -349,7 +365,10 @@ def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: 
 
 
 def _fold_in(
-    vectors: Float64Array, exposures: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
+    vectors: Float64Array,
+    exposures: sparse.csr_matrix,
+    old_counts: IntArray,
+    step_counts: IntArray,
 ) -> Float64Array:
     """Vectors (n, D) moved towards the mean of their users' vectors, that of the items (users, n)
     shown, weighted by liking; new steps of an item weigh as much as old ones."""

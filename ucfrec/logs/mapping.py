@@ -326,7 +326,11 @@ def is_table(path: Path) -> bool:
 
 
 def load_release(
-    adapter: str, dataset: Dataset, name: str, folder: Path, part: str | None = None
+    adapter: str,
+    dataset: Dataset,
+    name: str,
+    folder: Path,
+    part: str | None = None,
 ) -> LogFiles:
     """The logs of a release with their columns mapped, downloaded to `folder` if not there yet.
 

@@ -67,7 +67,12 @@ class RowVectors:
     """The observation of every row of a log, in a file or in memory. Long rows are not sorted:
     where a row was in the files, its observation is read at the end."""
 
-    def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
+    def __init__(
+        self,
+        batches: Iterable[pa.RecordBatch],
+        size: int,
+        file: Path | None,
+    ) -> None:
         """Write to a file, or to memory, batches of `row`, from 1 on, and `observation`."""
         rows, self._file = 0, file
         with io.BytesIO() if file is None else file.open("xb") as out:
@@ -151,7 +156,12 @@ class SortedRows:
     large: int = 0
     """Number of rewards that are too large to train with."""
 
-    def add(self, batch: dict[str, Array], duplicates: str, by_session: bool) -> None:
+    def add(
+        self,
+        batch: dict[str, Array],
+        duplicates: str,
+        by_session: bool,
+    ) -> None:
         """Add rows as of `order_rows`, all of their users; leave out duplicates, undefined rewards.
         With `by_session`, rows of a session follow each other: sessions of one user may overlap."""
         keys = (USER, schema.TIMESTAMP, ITEM if ITEM in batch else schema.ACTION)
@@ -193,7 +203,10 @@ class SortedRows:
         self.file.append(batch)
 
     def _put_winners_first(
-        self, batch: dict[str, Array], repeated: BoolArray, duplicates: str
+        self,
+        batch: dict[str, Array],
+        repeated: BoolArray,
+        duplicates: str,
     ) -> dict[str, Array]:
         """The rows with the one that counts as the first of those that repeat the one before."""
         places = np.flatnonzero(repeated | np.append(repeated[1:], False))
@@ -276,7 +289,12 @@ def code_ids(name: str, rows: str) -> str:
     )
 
 
-def mark_faults(log: TypedLog, rows: str, known_items: Path | None, any_held: bool = False) -> str:
+def mark_faults(
+    log: TypedLog,
+    rows: str,
+    known_items: Path | None,
+    any_held: bool = False,
+) -> str:
     """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
     get a hash. With `known_items`, of a store, other items are a fault; with `any_held`, rows of
     the relation `HELD`."""

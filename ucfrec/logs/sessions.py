@@ -307,7 +307,10 @@ def _require_usable(rows: SortedRows, cut: Cut, counts: StepCounts) -> None:
 
 
 def number_ids(
-    log: TypedLog, features: Mapping[str, Sequence[str]], store: Path | None, grows: bool
+    log: TypedLog,
+    features: Mapping[str, Sequence[str]],
+    store: Path | None,
+    grows: bool,
 ) -> None:
     """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`; after
     `count_steps`. Ids are those of the steps and of feature tables (by id column). Those of a
@@ -420,7 +423,11 @@ def write_steps(
             schema.SPLIT: episodes.splits,
             schema.TERMINATED: episodes.terminated,
         }
-        writer.append(steps, first, {n: np.repeat(v, lengths) for n, v in values.items()})
+        writer.append(
+            steps,
+            first,
+            {n: np.repeat(v, lengths) for n, v in values.items()},
+        )
         display.update(count)
     return writer
 

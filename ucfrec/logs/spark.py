@@ -101,7 +101,11 @@ def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Itera
 
 
 def sort_with_spark(
-    tables: LogTables, known_items: Path | None, scratch: Path, duplicates: str, master: str
+    tables: LogTables,
+    known_items: Path | None,
+    scratch: Path,
+    duplicates: str,
+    master: str,
 ) -> SortedRows:
     """`sort_rows` with Spark, which loads the sorted rows and the numbers of ids.
 
@@ -132,7 +136,10 @@ def sort_with_spark(
 
 
 def _type_rows(
-    spark: Any, tables: LogTables, known_items: Path | None, scratch: Path
+    spark: Any,
+    tables: LogTables,
+    known_items: Path | None,
+    scratch: Path,
 ) -> tuple[TypedLog, Any]:
     """The log, and a Spark frame of its rows as of `mark_faults`, read from files in `scratch`."""
     typed = type_columns(tables)
@@ -207,7 +214,12 @@ class UserLog:
     """`items.parquet` of a store or run: rows with other items are left out; None for all."""
 
 
-def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[int]:
+def map_users(
+    source: UserLog,
+    folder: Path,
+    master: str,
+    work: Work,
+) -> list[int]:
     """Give each part of the users of a log to a worker, for `work`; returns the counts of the parts
     that have a usable row, users in sorted order. Warns of the rows that are left out.
 
@@ -244,7 +256,10 @@ def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[in
 
 
 def _work_on_part(
-    work: Work, mapping: LogMapping, name: str, batches: Iterator[pa.RecordBatch]
+    work: Work,
+    mapping: LogMapping,
+    name: str,
+    batches: Iterator[pa.RecordBatch],
 ) -> Iterator[pa.RecordBatch]:
     from pyspark import TaskContext
 

@@ -243,7 +243,10 @@ class NoRowsError(InputError):
 
 
 def require_rows(
-    log: TypedLog, count: int, dropped: Mapping[str, int], grown: Path | None = None
+    log: TypedLog,
+    count: int,
+    dropped: Mapping[str, int],
+    grown: Path | None = None,
 ) -> None:
     """Raise NoRowsError if no row is left, of a log that is perhaps added to a store, `grown`,
     whose end is the earliest time."""
@@ -291,7 +294,13 @@ def note_dropped(
     warn_user(f"{name}: {total}" if name else total)
 
 
-def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: str) -> None:
+def note_unknown(
+    name: str,
+    column: str,
+    unknown: int,
+    total: int,
+    known_ids: str,
+) -> None:
     """Warn where nearly all of many users or items of a log are not among those of, say, a store
     (`known_ids`), as if written in another way."""
     if total < FEW_IDS or unknown < MOST_UNKNOWN * total:

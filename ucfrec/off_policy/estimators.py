@@ -230,7 +230,10 @@ def tune(
 
 
 def mean_squared_error(
-    weights: Float64Array, shrunk: Float64Array, left: Float64Array, value: Float64Array
+    weights: Float64Array,
+    shrunk: Float64Array,
+    left: Float64Array,
+    value: Float64Array,
 ) -> float:
     """Estimated mean squared error of E_n[value + shrunk · left] (Su et al. 2020, section 5)."""
     bias = float(((weights - shrunk) * left).mean())
@@ -264,7 +267,10 @@ class StepSums:
 
 
 def normalise_by_step(
-    steps: LoggedSteps, left: Float64Array, v: Float64Array | None, sums: StepSums
+    steps: LoggedSteps,
+    left: Float64Array,
+    v: Float64Array | None,
+    sums: StepSums,
 ) -> Float64Array:
     """(S,) estimate plus influence (the derivative by a session's share) of each session.
 
@@ -321,7 +327,10 @@ NO_INTERVAL: Final = (None, None, None, None)
 
 
 def cluster_intervals(
-    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
+    above: Float64Array,
+    below: Float64Array,
+    cluster: IntArray | None,
+    seed: int,
 ) -> list[Interval | None]:
     """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below.
 
@@ -367,7 +376,10 @@ class Resamples:
 
 
 def resample(
-    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
+    above: Float64Array,
+    below: Float64Array,
+    cluster: IntArray | None,
+    seed: int,
 ) -> Resamples:
     """Draw clusters with replacement, each with all its sessions: `cluster_intervals`."""
     names = number_clusters(cluster, len(above))
@@ -391,7 +403,11 @@ def resample(
     # How often each cluster is drawn stands for the resampled rows; as floats, some at a time.
     counts = np.array_split(_draw_counts(clusters, seed), max(1, clusters // _CLUSTERS_AT_ONCE))
     sums = np.concatenate([times.astype(np.float64) @ moments for times in counts])
-    e, b, ee, eb, bb = sums.reshape(-1, 5, len(value)).swapaxes(0, 1)
+    e, b, ee, eb, bb = sums.reshape(
+        -1,
+        5,
+        len(value),
+    ).swapaxes(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(b > 0, e / b, np.nan)
         spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)

@@ -319,7 +319,10 @@ def make_report(
 
 
 def _make_rows(
-    base: ResultRow, estimates: Mapping[str, Estimate], rule: DecisionRule, judged: dict[str, Any]
+    base: ResultRow,
+    estimates: Mapping[str, Estimate],
+    rule: DecisionRule,
+    judged: dict[str, Any],
 ) -> list[ResultRow]:
     """A row like `base` for each estimate."""
     rows, units = [], "sessions" if base.metric == "R_cum" else "steps"
@@ -417,7 +420,12 @@ def collect_steps(
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
     target, end = np.empty(len(items)), 0
     groups = ItemGroups(
-        np.where(items >= 0, group_of[items], -1), array_on_disk((len(items), one_hot.shape[1]))
+        np.where(
+            items >= 0,
+            group_of[items],
+            -1,
+        ),
+        array_on_disk((len(items), one_hot.shape[1])),
     )
     inputs = InputsFile(len(items))
     shown_before = logged.rows if options.filter_seen else None

@@ -221,7 +221,12 @@ class LoggedSteps:
         numbers = (np.cumsum(sessions) - 1)[self.session[rows]]
         return self.regroup(rows, numbers, None if self.user is None else self.user[sessions])
 
-    def regroup(self, rows: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
+    def regroup(
+        self,
+        rows: IntArray,
+        session: IntArray,
+        user: IntArray | None,
+    ) -> "LoggedSteps":
         """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
         taken: dict[str, Any] = {}
         for name, value in vars(self).items():

@@ -179,7 +179,11 @@ class BehaviorModel:
 
 
 def fit_behavior(
-    states: Float32Array, item: IntArray, group: IntArray, owner: IntArray, seed: int
+    states: Float32Array,
+    item: IntArray,
+    group: IntArray,
+    owner: IntArray,
+    seed: int,
 ) -> BehaviorModel:
     """Estimate the probabilities with which the logged items (N,) and their groups (N,), from 0,
     were chosen in states (N, S), of which some thousand are read at once; `owner` (N,) is the user,
@@ -228,7 +232,12 @@ def fit_behavior(
 class _GroupModel:
     """Probabilities of groups given a state."""
 
-    def __init__(self, states: Float32Array, group: IntArray, shares: Float64Array) -> None:
+    def __init__(
+        self,
+        states: Float32Array,
+        group: IntArray,
+        shares: Float64Array,
+    ) -> None:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
         from sklearn.pipeline import make_pipeline
@@ -241,7 +250,12 @@ class _GroupModel:
             model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
             self._model = make_pipeline(StandardScaler(), model).fit(states, group)
 
-    def predict(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
+    def predict(
+        self,
+        states: Float32Array,
+        temperature: float,
+        share: float,
+    ) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
@@ -371,7 +385,11 @@ class _Sums(NamedTuple):
 
 
 def _fit_to_others(
-    sums: _Sums, fold: int, reward: Float64Array, horizon: int, discount: float
+    sums: _Sums,
+    fold: int,
+    reward: Float64Array,
+    horizon: int,
+    discount: float,
 ) -> tuple[Float64Array, int, bool]:
     """Weights (2, P) of the reward model and of Q that know all folds but one, with the rewards of
     these others; how many regressions they took, and whether Q stayed in bounds."""

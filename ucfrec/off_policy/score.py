@@ -156,7 +156,10 @@ def prepare_sessions(
 
 
 def _add_history(
-    trained: TrainedPolicy, store: EpisodeStore, users: Array, earlier: EpisodeStore | None
+    trained: TrainedPolicy,
+    store: EpisodeStore,
+    users: Array,
+    earlier: EpisodeStore | None,
 ) -> tuple[EpisodeStore, UserRows]:
     """The sessions and all rows of their users; earlier rows of a session that goes on are a part
     of it, as in `recommend`, but where sessions have ids, which the store does not keep."""

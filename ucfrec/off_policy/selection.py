@@ -89,7 +89,10 @@ class Selection:
 
 
 def select(
-    names: Sequence[str], terms: Float64Array, seed: int, user: IntArray | None = None
+    names: Sequence[str],
+    terms: Float64Array,
+    seed: int,
+    user: IntArray | None = None,
 ) -> Selection:
     """Rank K candidates by estimates on the same sessions.
 
@@ -154,7 +157,12 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
             excluded[name] = "; ".join(report.verdict.reasons)
     if not terms:
         return Selection((), math.nan, math.nan, excluded)
-    ranked = select([*terms], np.stack([*terms.values()], axis=1), seed, reports[first].user)
+    ranked = select(
+        [*terms],
+        np.stack([*terms.values()], axis=1),
+        seed,
+        reports[first].user,
+    )
     return replace(ranked, excluded=excluded)
 
 

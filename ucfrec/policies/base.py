@@ -130,7 +130,11 @@ class SequencePolicy(nn.Module, ABC):
 
     @classmethod
     def training_view(
-        cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
+        cls,
+        train: EpisodeStore,
+        config: PolicyConfig,
+        folder: Path,
+        seed: int,
     ) -> EpisodeStore:
         """The episodes to train on, derived from the training episodes; by default the share
         `best_share` of them with the highest returns. The folder keeps intermediate results of a
@@ -145,7 +149,11 @@ class SequencePolicy(nn.Module, ABC):
         """Set buffers from the training episodes, before the first update."""
 
     def make_solver(
-        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+        self,
+        train: EpisodeStore,
+        validation: EpisodeStore | None,
+        folder: Path,
+        seed: int,
     ) -> Callable[[], None] | None:
         """What fits the policy without the training loop; None if gradients have to. Validation
         episodes are None in a refit, which keeps what was `chosen` on them."""
@@ -234,7 +242,10 @@ class SequencePolicy(nn.Module, ABC):
         return best * self.return_scale
 
     def exposed(
-        self, windows: Windows, steps: Tensor | None = None, last: bool = False
+        self,
+        windows: Windows,
+        steps: Tensor | None = None,
+        last: bool = False,
     ) -> Exposed | None:
         """What was shown before each of the (B·K) steps, before the `steps` of a mask (B, K), or
         before the `last` steps (B,) alone; None without `policy.exposure`."""
@@ -331,7 +342,11 @@ class ValueHead(nn.Module):
         super().__init__()
         self.embed = nn.Linear(state_size + 1 + dim, dim)
         self.history = nn.GRU(dim, dim, batch_first=True)
-        self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
+        self.out = nn.Sequential(
+            nn.Linear(dim, dim),
+            nn.ReLU(),
+            nn.Linear(dim, 2),
+        )
 
     def forward(self, windows: Windows, actions: Tensor) -> Tensor:
         """Mean and expectile (B, K, 2), of normalised windows and their embedded actions (B, K, d),

@@ -106,7 +106,11 @@ class PopularPolicy(ScoringPolicy):
             self.register_buffer("half_life", torch.tensor(config.half_life or math.inf))
 
     def make_solver(
-        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+        self,
+        train: EpisodeStore,
+        validation: EpisodeStore | None,
+        folder: Path,
+        seed: int,
     ) -> Callable[[], None] | None:
         """Sets the biases, unless settings add something to learn; likes are of items only."""
         config = self.config
@@ -143,7 +147,10 @@ class PopularPolicy(ScoringPolicy):
 
     @classmethod
     def best_half_life(
-        cls, train: EpisodeStore, validation: EpisodeStore, liked_of: LikedOf = liked_rewards
+        cls,
+        train: EpisodeStore,
+        validation: EpisodeStore,
+        liked_of: LikedOf = liked_rewards,
     ) -> float:
         """The half-life (hours) with the lowest loss on validation episodes; of equal ones, the
         longest. The loss is the log loss of likes by rates, otherwise that of the liked items."""
@@ -254,7 +261,11 @@ class ItemKNNPolicy(ScoringPolicy):
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
     def make_solver(
-        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+        self,
+        train: EpisodeStore,
+        validation: EpisodeStore | None,
+        folder: Path,
+        seed: int,
     ) -> Callable[[], None]:
         """Chooses the temperature; everything else is set by `start_from`."""
         return lambda: None if validation is None else self._choose_temperature(validation)
@@ -266,7 +277,8 @@ class ItemKNNPolicy(ScoringPolicy):
         episodes, steps = held_out.locate(numbers)
         windows = held_out.windows(episodes, steps, self.config.context)
         windows = windows.to(self.cosines.device)
-        scores, items = self.similarity(*Shown.before_last(windows)), windows.actions[:, -1:]
+        shown, items = Shown.before_last(windows), windows.actions[:, -1:]
+        scores = self.similarity(shown.items, shown.rewards)
         of_shown = scores.gather(1, items).mean()
         assert isinstance(self.head, ItemHead)
         low, high = 0.0, _HOTTEST
@@ -290,7 +302,8 @@ class ItemKNNPolicy(ScoringPolicy):
 
     def act(self, windows: Windows) -> Tensor:
         """Logits over items at the last step, (B, n_items)."""
-        scores = self.similarity(*Shown.before_last(windows))
+        shown = Shown.before_last(windows)
+        scores = self.similarity(shown.items, shown.rewards)
         return self.temperature * scores + self.head.get_parameter("bias")
 
 
@@ -427,7 +440,11 @@ class BoostedPolicy(LikedPolicy):
             self.tag.copy_(states.tags[:, 0])
 
     def make_solver(
-        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+        self,
+        train: EpisodeStore,
+        validation: EpisodeStore | None,
+        folder: Path,
+        seed: int,
     ) -> Callable[[], None]:
         """Fits the trees."""
 
@@ -467,7 +484,12 @@ class BoostedPolicy(LikedPolicy):
         mean = (self.liked.sum() + 0.5) / (self.impressions.sum() + 1)
         return torch.logit((liked + PRIOR * mean) / (impressions + PRIOR))
 
-    def _inputs(self, windows: Windows, items: Tensor, counts: Tensor | None = None) -> Tensor:
+    def _inputs(
+        self,
+        windows: Windows,
+        items: Tensor,
+        counts: Tensor | None = None,
+    ) -> Tensor:
         """Inputs (B, C, F) of the trees for items (C,) or (B, C) at the windows' last steps, whose
         action and reward are not read; counts (2, B, C) of shown and liked ones, or None for all
         rows."""

@@ -74,7 +74,10 @@ class _ConvBlock(nn.Module):
         )
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), Dropout(config.dropout)
+            nn.Linear(dim, 4 * dim),
+            nn.GELU(),
+            nn.Linear(4 * dim, dim),
+            Dropout(config.dropout),
         )
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
@@ -171,7 +174,10 @@ class _LongShortBlock(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), Dropout(config.dropout)
+            nn.Linear(dim, 4 * dim),
+            nn.GELU(),
+            nn.Linear(4 * dim, dim),
+            Dropout(config.dropout),
         )
         self.mlp_norm = nn.LayerNorm(dim)
         self.dropout = Dropout(config.dropout)

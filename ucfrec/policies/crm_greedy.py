@@ -63,7 +63,11 @@ class CRMGreedyPolicy(SequencePolicy):
         self.candidates.copy_(torch.from_numpy(actions[sample]))
 
     def make_solver(
-        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+        self,
+        train: EpisodeStore,
+        validation: EpisodeStore | None,
+        folder: Path,
+        seed: int,
     ) -> Callable[[], None] | None:
         """For items, fits the reward model; its effects are chosen on a tenth of the episodes if
         none are held out."""

@@ -68,7 +68,10 @@ class DTPolicy(SequencePolicy):
         return self.embed(windows, self.head.embed(windows.actions))  # type: ignore[no-any-return]
 
     def attend(
-        self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor, rows: slice | None = None
+        self,
+        tokens: tuple[Tensor, Tensor, Tensor],
+        mask: Tensor,
+        rows: slice | None = None,
     ) -> Tensor:
         """Outputs (B, 3K, d) at the tokens R_0, s_0, a_0, R_1, …, or the `rows` of them alone;
         `mask` (B, K) is false at padding."""
@@ -92,10 +95,19 @@ class Block(nn.Module):
         self.query_key_value = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
         self.mlp_norm = nn.LayerNorm(dim)
-        self.mlp = nn.Sequential(nn.Linear(dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim))
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, 4 * dim),
+            nn.ReLU(),
+            nn.Linear(4 * dim, dim),
+        )
         self.dropout = Dropout(config.dropout)
 
-    def forward(self, hidden: Tensor, visible: Tensor, rows: slice | None = None) -> Tensor:
+    def forward(
+        self,
+        hidden: Tensor,
+        visible: Tensor,
+        rows: slice | None = None,
+    ) -> Tensor:
         """Map (B, L, d) to (B, L, d), or to the `rows` (B, M, d) of it; `visible` (B, 1, L, L)
         comes from `visible_tokens`."""
         normed = self.attention_norm(hidden)
@@ -104,7 +116,11 @@ class Block(nn.Module):
         else:
             layer, dim = self.query_key_value, hidden.shape[-1]
             query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
-            key, value = F.linear(normed, layer.weight[dim:], layer.bias[dim:]).chunk(2, dim=-1)
+            key, value = F.linear(
+                normed,
+                layer.weight[dim:],
+                layer.bias[dim:],
+            ).chunk(2, dim=-1)
             hidden, visible = hidden[:, rows], visible[:, :, rows]
         rate = self.rate if self.training else 0.0
         mixed = attend(query, key, value, visible, self.heads, rate)
@@ -113,7 +129,10 @@ class Block(nn.Module):
 
 
 def pass_rows(
-    blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice | None
+    blocks: Iterable[nn.Module],
+    hidden: Tensor,
+    visible: Tensor,
+    rows: slice | None,
 ) -> Tensor:
     """The `rows` (B, M, d), or all, of what `Block`s make of tokens (B, L, d)."""
     *first_blocks, last = blocks
@@ -123,14 +142,25 @@ def pass_rows(
 
 
 def attend(
-    query: Tensor, key: Tensor, value: Tensor, visible: Tensor, heads: int, dropout: float = 0.0
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    visible: Tensor,
+    heads: int,
+    dropout: float = 0.0,
 ) -> Tensor:
     """Scaled dot-product attention (B, M, d) of queries (B, M, d) to keys and values (B, L, d) that
     are `visible` (B, 1, M, L), some in each row; drops weights as `Dropout`."""
     batch, rows, dim = query.shape
     # (B, L, d) -> (B, H, L, d/H)
     query, key, value = (
-        x.view(batch, -1, heads, dim // heads).transpose(1, 2) for x in (query, key, value)
+        x.view(
+            batch,
+            -1,
+            heads,
+            dim // heads,
+        ).transpose(1, 2)
+        for x in (query, key, value)
     )
     if dropout == 0 or query.device.type != "cpu":
         mixed = F.scaled_dot_product_attention(query, key, value, visible, dropout)
@@ -169,7 +199,11 @@ class CDT4RecPolicy(DTPolicy):
         self.register_buffer("reward_mean", torch.zeros(()))
         self.register_buffer("reward_std", torch.ones(()))
         self.attention = nn.MultiheadAttention(dim, config.heads, batch_first=True)
-        self.estimate = nn.Sequential(nn.Linear(2 * dim, dim), nn.ReLU(), nn.Linear(dim, 1))
+        self.estimate = nn.Sequential(
+            nn.Linear(2 * dim, dim),
+            nn.ReLU(),
+            nn.Linear(dim, 1),
+        )
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set the mean and standard deviation of the training rewards."""
@@ -260,7 +294,10 @@ class DT4RecPolicy(DTPolicy):
         return imitation + config.contrastive_weight * contrast, scalars
 
     def contrastive_loss(
-        self, windows: Windows, encoded: tuple[Tensor, Tensor], features: Tensor
+        self,
+        windows: Windows,
+        encoded: tuple[Tensor, Tensor],
+        features: Tensor,
     ) -> Tensor:
         """InfoNCE (nats) of the logged return against those of other windows, mean over all steps
         of normalised windows with `features` (B, K, d) and `encoded` tokens s_t and a_t."""

@@ -57,7 +57,8 @@ class ConservativeQ(nn.Module):
         mean, std = store.state_statistics
         count, column = store.n_steps, schema.ITEM if store.has_items else schema.ACTION
         sample = np.linspace(0, count - 1, min(count, _LOGGED)).astype(np.int64)
-        logged = torch.from_numpy(store.step_values(column, *store.locate(sample)))
+        episodes, steps = store.locate(sample)
+        logged = torch.from_numpy(store.step_values(column, episodes, steps))
         vectors = store.action_vectors(logged.long() if store.has_items else logged)
         every = store.item_states.embeddings if store.has_items else None
         self.register_buffer("state_mean", mean)
@@ -72,7 +73,12 @@ class ConservativeQ(nn.Module):
         self.target.load_state_dict(self.network.state_dict())
         self.target.requires_grad_(False)
 
-    def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+    def q(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        network: nn.Module | None = None,
+    ) -> Tensor:
         """Values (M, C) of actions (M, C, A) in states (M, S), by `network` or the trained one."""
         states = standardise(states, self.state_mean, self.state_std)
         states = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
@@ -112,7 +118,11 @@ class ConservativeQ(nn.Module):
 
 @random_state_kept()
 def relabel(
-    store: EpisodeStore, steps: int, weight: float, folder: Path, seed: int
+    store: EpisodeStore,
+    steps: int,
+    weight: float,
+    folder: Path,
+    seed: int,
 ) -> EpisodeStore:
     """The store, without augmented episodes, with returns-to-go raised by CQL's state values.
 
@@ -131,7 +141,8 @@ def relabel(
     )
 
     def draw(generator: np.random.Generator) -> Transitions:
-        return store.transitions(*store.draw_steps(generator, _BATCH_SIZE))
+        episodes, steps = store.draw_steps(generator, _BATCH_SIZE)
+        return store.transitions(episodes, steps)
 
     fit(network, draw, network.loss, loop, folder, seed=seed, describe="cql")
     torch.manual_seed(seed)
@@ -221,7 +232,11 @@ class EDT4RecPolicy(DTPolicy):
 
     @classmethod
     def training_view(
-        cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
+        cls,
+        train: EpisodeStore,
+        config: PolicyConfig,
+        folder: Path,
+        seed: int,
     ) -> EpisodeStore:
         """The episodes with returns-to-go raised by CQL; as logged if `relabel` is false."""
         assert isinstance(config, EDT4RecConfig)
@@ -255,7 +270,12 @@ class GaussianHead(VectorHead):
         """Log standard deviations (..., A) from features (..., d), clamped to [−5, 2]."""
         return self.log_deviation(features).clamp(-5.0, 2.0)  # type: ignore[no-any-return]
 
-    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
+    def losses(
+        self,
+        features: Tensor,
+        actions: Tensor,
+        exposed: Exposed | None = None,
+    ) -> Tensor:
         """Negative log-likelihood (nats) of each of M steps, (M,)."""
         log_deviation = self.deviations(features)
         error = (actions - self.predict(features)) / self.scale / log_deviation.exp()

@@ -59,7 +59,12 @@ class VectorHead(nn.Module):
         """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
-    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
+    def losses(
+        self,
+        features: Tensor,
+        actions: Tensor,
+        exposed: Exposed | None = None,
+    ) -> Tensor:
         """The mean squared error (M,) of each of M steps in units of `scale`, from features (M, d)
         and actions (M, A)."""
         error = (self.predict(features) - actions) / self.scale
@@ -165,7 +170,12 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
+    def losses(
+        self,
+        features: Tensor,
+        actions: Tensor,
+        exposed: Exposed | None = None,
+    ) -> Tensor:
         """The negative log-likelihood (nats) of each of M steps, (M,): features (M, d), actions
         (M,)."""
         if not self.samples:
@@ -206,7 +216,12 @@ class ItemHead(nn.Module):
         items, log_weights = self._proposal.draw(self.samples)
         return items, self.predict(features, exposed, items, log_weights), log_weights
 
-    def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
+    def logit(
+        self,
+        features: Tensor,
+        actions: Tensor,
+        exposed: Exposed | None,
+    ) -> Tensor:
         """Logits (M,) of the logged items."""
         product = (features * self.embed(actions)).sum(-1) / features.shape[-1] ** 0.5
         logit: Tensor = product + self._gather_bias(actions)

@@ -98,7 +98,11 @@ class UCFPolicy(SequencePolicy):
         self.fuse_norm = nn.LayerNorm(dim)
         self.attention = SupervisedAttention(config)
         self.mlp_norm = nn.LayerNorm(dim)
-        self.mlp = nn.Sequential(nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim))
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, 4 * dim),
+            nn.GELU(),
+            nn.Linear(4 * dim, dim),
+        )
         self.dropout = Dropout(config.dropout)
         self.final_norm = nn.LayerNorm(dim)
 
@@ -196,7 +200,12 @@ class SupervisedAttention(nn.Module):
         self.out = nn.Linear(config.dim, config.dim)
         self.dropout = Dropout(config.dropout)
 
-    def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self,
+        states: Tensor,
+        tokens: Tensor,
+        visible: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d), R_0, s_0, a_0, R_1, …, that are
         `visible` (B, Q, 3K), at least one in a row: output (B, Q, d) without dropout of its own,
         and probabilities (B, H, Q, 3K) before dropout."""
@@ -311,7 +320,12 @@ class _ShiftedProducts(torch.autograd.Function):
     """`shift_products` of steps (B, K, d), taps (3, d) and a bias (d,), with its gradient."""
 
     @staticmethod
-    def forward(ctx: Any, steps: Tensor, taps: Tensor, bias: Tensor) -> Any:
+    def forward(
+        ctx: Any,
+        steps: Tensor,
+        taps: Tensor,
+        bias: Tensor,
+    ) -> Any:
         ctx.save_for_backward(steps, taps)
         return shift_products(steps, taps, bias)
 
@@ -365,7 +379,12 @@ def visible_tokens(valid: Tensor) -> Tensor:
     return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
 
 
-def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:
+def parent_targets(
+    mask: Tensor,
+    window: int,
+    decay: float,
+    previous_action: float,
+) -> Tensor:
     """Target attention q (B, K, 3K) of the row that predicts a_t, over R_0, s_0, a_0, R_1, …
 
     Its parents are Ĝ_t and s_t with weight 1, s_{t−k} with weight decay^k for 1 ≤ k ≤ window, and
@@ -376,10 +395,21 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
     back = torch.arange(length).unsqueeze(1) - torch.arange(length)  # (K, K) t − j
     weights = torch.zeros(length, length, 3)
     weights[..., 0] = (back == 0).float()
-    weights[..., 1] = torch.where((back >= 0) & (back <= window), decay ** back.clamp(min=0), 0.0)
+    weights[..., 1] = torch.where(
+        (back >= 0) & (back <= window),
+        decay ** back.clamp(min=0),
+        0.0,
+    )
     weights[..., 2] = previous_action * (back == 1).float()
     weights = (
-        weights.to(mask.device) * mask.view(batch, 1, length, 1) * mask.view(batch, length, 1, 1)
+        weights.to(mask.device)
+        * mask.view(
+            batch,
+            1,
+            length,
+            1,
+        )
+        * mask.view(batch, length, 1, 1)
     )
     targets = weights.reshape(batch, length, 3 * length)
     return targets / targets.sum(-1, keepdim=True).clamp(min=EPSILON)
@@ -441,9 +471,21 @@ class StackedStreams:
         """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""
         layer, (_, batch, length, dim) = self._policy.attention, tokens.shape
         heads, size = layer.heads, dim // layer.heads
-        query = layer.query(layer.norm(tokens[1, :, -1])).view(batch, heads, 1, size)
+        query = layer.query(layer.norm(tokens[1, :, -1])).view(
+            batch,
+            heads,
+            1,
+            size,
+        )
         both = layer.key_value(layer.norm(tokens)).view(3, batch, length, 2, heads, size)
-        key, value = both.permute(3, 1, 4, 0, 2, 5).reshape(2, batch, heads, -1, size)
+        key, value = both.permute(
+            3,
+            1,
+            4,
+            0,
+            2,
+            5,
+        ).reshape(2, batch, heads, -1, size)
         scores = query @ key.transpose(-2, -1) / size**0.5  # (B, H, 1, 3K)
         hidden = ~mask.repeat(1, 3)
         # Its own action comes after s_t.

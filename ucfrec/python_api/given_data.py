@@ -99,7 +99,10 @@ def _read_columns(columns: Columns | None) -> LogMapping:
 
 
 def prepare_store(
-    data: EpisodeStore | Logs, mapping: Columns | None, scratch: Path, options: Mapping[str, Any]
+    data: EpisodeStore | Logs,
+    mapping: Columns | None,
+    scratch: Path,
+    options: Mapping[str, Any],
 ) -> EpisodeStore:
     """The store that `data` is, or one prepared from the logs in it.
 
@@ -154,7 +157,10 @@ def _note_dropped(report: Mapping[str, Any], **how: Any) -> None:
 
 @contextmanager
 def read_logs(
-    trained: TrainedPolicy, logs: Logs | None, mapping: Columns | None, keep_unknown: bool
+    trained: TrainedPolicy,
+    logs: Logs | None,
+    mapping: Columns | None,
+    keep_unknown: bool,
 ) -> Iterator[LoggedSessions]:
     """Later logs of a policy, or None for the test split of its store.
 
@@ -190,9 +196,9 @@ def open_files(
         InputError: a path is missing, or the frame cannot be used.
     """
     columns = _read_columns(mapping)
-    how = columns_used(trained, columns), reward_of(trained)
+    used, reward = columns_used(trained, columns), reward_of(trained)
     with scratch_folder(Path(gettempdir()), "frame") as scratch:
-        yield _find_files(logs, columns, partial(later_logs, trained), scratch, *how)
+        yield _find_files(logs, columns, partial(later_logs, trained), scratch, used, reward)
 
 
 def read_histories(

@@ -94,7 +94,10 @@ class Recommender:
     """
 
     def __init__(
-        self, policy: str = "ucf", settings: Mapping[str, Any] | Sequence[str] = (), seed: int = 0
+        self,
+        policy: str = "ucf",
+        settings: Mapping[str, Any] | Sequence[str] = (),
+        seed: int = 0,
     ) -> None:
         """
         Args:
@@ -466,7 +469,11 @@ class Recommender:
 
     @_checked
     def export(
-        self, folder: Path | str, k: int | None = None, *, rule: DecisionRule | None = None
+        self,
+        folder: Path | str,
+        k: int | None = None,
+        *,
+        rule: DecisionRule | None = None,
     ) -> Exported:
         """Write the policy with its rule as an ONNX graph: `ucfrec export`.
 

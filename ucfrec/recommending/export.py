@@ -75,7 +75,11 @@ class Exported(NamedTuple):
 
 
 def export(
-    trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
+    trained: TrainedPolicy,
+    out: Path,
+    *,
+    rule: DecisionRule | None = None,
+    k: int | None = None,
 ) -> Exported:
     """Write a folder with the graph (`model.onnx`) and `model.json`.
 
@@ -114,7 +118,12 @@ def export(
 class _Network(nn.Module):
     """A scorer as a module, with its weights; InputError if the policy has no vectors of items."""
 
-    def __init__(self, scorer: Scorer, kind: str, remedy: str) -> None:
+    def __init__(
+        self,
+        scorer: Scorer,
+        kind: str,
+        remedy: str,
+    ) -> None:
         super().__init__()
         if not scorer.has_factors:
             raise InputError(
@@ -133,7 +142,12 @@ class _Network(nn.Module):
 class RuleGraph(_Network):
     """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
 
-    def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
+    def __init__(
+        self,
+        scorer: Scorer,
+        kind: str,
+        k: int | None,
+    ) -> None:
         assert scorer.states is not None
         super().__init__(
             scorer,
@@ -197,7 +211,12 @@ def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Te
     return score
 
 
-def _draw_inputs(scorer: Scorer, sessions: int, seed: int, mask: bool = False) -> dict[str, Tensor]:
+def _draw_inputs(
+    scorer: Scorer,
+    sessions: int,
+    seed: int,
+    mask: bool = False,
+) -> dict[str, Tensor]:
     """Random inputs of a graph, of sessions of at most twice as many steps as the scorer reads; the
     items excluded are numbers, or a `mask` of all items."""
     states, length, rng = scorer.states, scorer.length, np.random.default_rng(seed)
@@ -239,7 +258,10 @@ def _run_graph(runner: Any, inputs: dict[str, Tensor]) -> list[Array]:
 
 
 def _measure_difference(
-    network: _Network, runner: Any, inputs: dict[str, Tensor], remedy: str
+    network: _Network,
+    runner: Any,
+    inputs: dict[str, Tensor],
+    remedy: str,
 ) -> float:
     """`require_close` of the scores that a graph and its network give."""
     with torch.no_grad():
@@ -269,7 +291,14 @@ def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: floa
         ours = tensor.numpy()
         differ = ours != theirs  # −∞ does not differ from itself
         ours, theirs = ours[differ], theirs[differ]
-        apart = np.abs(ours - theirs) / np.maximum(size, np.where(np.isinf(ours), size, abs(ours)))
+        apart = np.abs(ours - theirs) / np.maximum(
+            size,
+            np.where(
+                np.isinf(ours),
+                size,
+                abs(ours),
+            ),
+        )
         largest = float(np.maximum(largest, apart.max(initial=0.0)))
     if not largest <= TOLERANCE:
         raise InputError(

@@ -51,7 +51,10 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
 
 @contextmanager
 def exposures_written(
-    path: Path, trained: TrainedPolicy, rule: str, frames: Iterable[pd.DataFrame]
+    path: Path,
+    trained: TrainedPolicy,
+    rule: str,
+    frames: Iterable[pd.DataFrame],
 ) -> Iterator[Iterator[pd.DataFrame]]:
     """Yield the same frames of `recommend`, also written to a file, whole once the block ends."""
     columns, now = exposure_schema(trained), int(time.time() * 1000)

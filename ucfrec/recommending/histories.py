@@ -52,7 +52,10 @@ def histories_of_files(
 
 
 def histories_of_frame(
-    trained: TrainedPolicy, frame: pd.DataFrame, mapping: LogMapping, stored: bool = False
+    trained: TrainedPolicy,
+    frame: pd.DataFrame,
+    mapping: LogMapping,
+    stored: bool = False,
 ) -> Iterator[Histories]:
     """`histories_of_files` of a frame with one row per interaction.
 

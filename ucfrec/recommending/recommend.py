@@ -181,7 +181,11 @@ class Chooser:
         return items, scores, propensities
 
     def _choose_together(
-        self, latest: Histories, requests: Array, k: int, excluded: Tensor | None
+        self,
+        latest: Histories,
+        requests: Array,
+        k: int,
+        excluded: Tensor | None,
     ) -> tuple[Array, Array, Array]:
         """`choose` with one forward pass, of latest sessions."""
         rule = self.scorer.rule
@@ -270,7 +274,12 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
     return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)
 
 
-def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
+def uniforms(
+    users: Array,
+    requests: Array,
+    count: int,
+    seed: int,
+) -> Tensor:
     """Draws (B, count) from [0, 1), float64, that depend on the user, the request and the seed.
 
     A request is answered the same in any batch. The numbers are SplitMix64's (Steele et al., 2014),
@@ -367,7 +376,13 @@ class ItemIndex:
         items, scores = candidates.gather(1, best), scores.gather(1, best)
         short = torch.isneginf(scores[:, -1])
         sampled = torch.zeros(len(short), dtype=torch.bool)
-        sampled[self._rng.choice(len(short), size=-(-len(short) // _SAMPLE), replace=False)] = True
+        sampled[
+            self._rng.choice(
+                len(short),
+                size=-(-len(short) // _SAMPLE),
+                replace=False,
+            )
+        ] = True
         for row in torch.nonzero(short | sampled)[:, 0].tolist():
             items_out = left_out[1][left_out[0] == row]
             row_out = torch.zeros_like(items_out), items_out

@@ -151,7 +151,12 @@ class Responder:
         means = {f"update_{name}": Mean(float(value), 1.0) for name, value in drift.items()}
         return means | self._unknown
 
-    def _count_unknown(self, what: str, count: int, of: int) -> None:
+    def _count_unknown(
+        self,
+        what: str,
+        count: int,
+        of: int,
+    ) -> None:
         total, weight = self._unknown[what]
         self._unknown[what] = Mean(total + count, weight + of)
 
@@ -258,7 +263,10 @@ class Served:
     """
 
     def __init__(
-        self, make: Callable[[Path], Responder], folder: Path, shares: Mapping[str, float] | None
+        self,
+        make: Callable[[Path], Responder],
+        folder: Path,
+        shares: Mapping[str, float] | None,
     ) -> None:
         """
         Args:

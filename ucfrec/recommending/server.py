@@ -51,7 +51,14 @@ class _Connection(H11Protocol):
     httptools does neither, and saves 5% of the processor time at most.
     """
 
-    def __init__(self, seconds: float, most: int, of_address: int, *server: Any, **options: Any):
+    def __init__(
+        self,
+        seconds: float,
+        most: int,
+        of_address: int,
+        *server: Any,
+        **options: Any,
+    ):
         super().__init__(*server, **options)
         self._seconds, self._most, self._of_address = seconds, most, of_address
         self._previous: tuple[object, int] | None = None

@@ -54,7 +54,12 @@ class _Answers:
     """Answers lines, and remembers the rows of the users who were heard of last; user 7 is user
     "7"."""
 
-    def __init__(self, responder: Responder, most: int, exposures: ExposureLog | None) -> None:
+    def __init__(
+        self,
+        responder: Responder,
+        most: int,
+        exposures: ExposureLog | None,
+    ) -> None:
         self._responder, self._exposures = responder, exposures
         self._most, self._count = most, 0
         self._rows: OrderedDict[str, list[Row]] = OrderedDict()

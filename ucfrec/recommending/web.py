@@ -302,7 +302,12 @@ class _Entrance:
     def __init__(self, app: ASGIApp, answer: Callable[[HTTPRequest], Awaitable[Response]]) -> None:
         self._app, self._answer = app, answer
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def __call__(
+        self,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+    ) -> None:
         headers, respond = scope.get("headers", ()), self._app
         size = len(scope.get("raw_path", b"")) + len(scope.get("query_string", b""))
         size += sum(len(name) + len(value) for name, value in headers)

@@ -140,7 +140,12 @@ def line_chart(
 
 
 @page_style()
-def histogram(title: str, x_label: str, counts: Sequence[float], names: Sequence[str]) -> Chart:
+def histogram(
+    title: str,
+    x_label: str,
+    counts: Sequence[float],
+    names: Sequence[str],
+) -> Chart:
     """Draw counts (N,) of N named bins as columns of equal width, whatever the bins' widths."""
     figure, axes = _plot_axes(x_label)
     axes.bar(range(len(counts)), counts, width=0.95, color=SERIES[0], alpha=0.55)

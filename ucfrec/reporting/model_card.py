@@ -67,7 +67,11 @@ def write_card(run: Path) -> Path:
 
 
 def add_measurement(
-    run: Path, how: str, of: str, values: Mapping[str, object], remarks: Sequence[str] = ()
+    run: Path,
+    how: str,
+    of: str,
+    values: Mapping[str, object],
+    remarks: Sequence[str] = (),
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 
@@ -108,7 +112,12 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *warnings])
 
 
-def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
+def add_ranking(
+    run: Path,
+    row: ResultRow,
+    on: str,
+    remarks: Sequence[str] = (),
+) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     values = _select_values(row, Ranking.shown, row.details["intervals"])
     of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
@@ -182,7 +191,10 @@ def _describe_rule(run: Path, record: RunRecord) -> str:
 
 
 def _list_limits(
-    run: Path, record: RunRecord, refitted: bool, window: Sequence[str]
+    run: Path,
+    record: RunRecord,
+    refitted: bool,
+    window: Sequence[str],
 ) -> list[object]:
     """Sentences, and false values for those that do not hold."""
     items, unknown = record.sizes["items"], record.data.unknown_propensities

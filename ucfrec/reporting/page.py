@@ -72,7 +72,10 @@ class _Run:
 
 
 def write_report(
-    out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
+    out: Path,
+    runs: Sequence[Path],
+    results: Sequence[Path] = (),
+    items: Path | None = None,
 ) -> None:
     """Write `render_report` to a file, atomically.
 

@@ -147,7 +147,8 @@ def _draw_rows(
         first, *values = map(evaluation_line(row).get, columns)
         ends = "–"
         if row.interval is not None:
-            intervals.append(Interval(name, row.value, *row.interval))
+            low, high = row.interval
+            intervals.append(Interval(name, row.value, low, high))
             ends = ", ".join(map(format_value, row.interval))
         body.append((name, [f"{format_value(first)} [{ends}]", *values]))
     chart = interval_chart(f"{title}, with 95% intervals", intervals)
@@ -161,7 +162,8 @@ def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
         logged |= {row.value for row in estimates.rows if row.method == LOGGED}
         if (row := find_quoted(estimates.rows)) and row.interval:
             name, reliable = f"{estimates.name}: {row.method}", row.details.get("reliable") is True
-            intervals.append(Interval(name, row.value, *row.interval, reliable))
+            low, high = row.interval
+            intervals.append(Interval(name, row.value, low, high, reliable))
     if not intervals:
         return None
     # The line is of one set of logs; several have a line each in their own charts.

@@ -56,7 +56,10 @@ def effective_number(weights: Float64Array) -> float:
 
 
 def group_auc(
-    scores: Float64Array, liked: BoolArray, owner: Array, n_users: int
+    scores: Float64Array,
+    liked: BoolArray,
+    owner: Array,
+    n_users: int,
 ) -> tuple[Float64Array, Float64Array]:
     """Per user (U,): AUC times impressions, and impressions (Zhu et al., KDD 2017).
 

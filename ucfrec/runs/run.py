@@ -324,7 +324,10 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
 
 
 def _dependencies(
-    train: EpisodeStore, validation: EpisodeStore, seed: int, device: torch.device
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    seed: int,
+    device: torch.device,
 ) -> dict[str, Any]:
     """All that a reward model or copies depend on, but for their settings."""
     return {

@@ -62,7 +62,12 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 
-def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
+def require_startable(
+    store: EpisodeStore,
+    train: EpisodeStore,
+    out: Path,
+    config: Config,
+) -> None:
     """Check that a run can begin, or go on, in the folder `out`; InputError if it holds another, or
     if rewards never vary, which augmentation needs."""
     if not (out / RUN).exists():
@@ -140,7 +145,11 @@ def begin(
     returns = people.returns
     if not returns_to_go.per_session:
         returns = people.with_return_to_go(returns_to_go).column(schema.RETURN_TO_GO)
-    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    places = np.linspace(
+        0,
+        len(returns) - 1,
+        min(len(returns), _MOST_RETURNS),
+    ).astype(np.int64)
     returns = np.sort(returns)[places].astype(np.float32)
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})

@@ -214,8 +214,14 @@ class TrainedPolicy:
 
     @cached_property
     def _scorer(self) -> Scorer:
-        record, models = self.record, (self.reward_model, self.session_end)
-        return Scorer(self.policy, self.rule, self.item_states, record.return_to_go, *models)
+        return Scorer(
+            self.policy,
+            self.rule,
+            self.item_states,
+            self.record.return_to_go,
+            self.reward_model,
+            self.session_end,
+        )
 
     def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
         """`scorer` of a policy of items; an `InputError` if its actions are vectors."""

@@ -55,7 +55,12 @@ _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
 
-def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
+def measure_run(
+    trained: TrainedPolicy,
+    store: EpisodeStore,
+    metric: str,
+    k: int,
+) -> float:
     """The metric of a finished run on its store, one of `METRICS`; higher is better.
 
     Raises:

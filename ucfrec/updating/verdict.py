@@ -176,8 +176,25 @@ def popularity_index(old: Array, new: Array) -> float:
 
 def reward_index(old: Float64Array, new: Float64Array) -> float:
     """`stability_index` of rewards in groups between deciles of the old ones."""
-    edges = np.unique(np.quantile(old, np.linspace(0, 1, _GROUPS + 1)[1:-1], method="lower"))
-    counts = [np.bincount(np.searchsorted(edges, x), None, len(edges) + 1) for x in (old, new)]
+    edges = np.unique(
+        np.quantile(
+            old,
+            np.linspace(
+                0,
+                1,
+                _GROUPS + 1,
+            )[1:-1],
+            method="lower",
+        )
+    )
+    counts = [
+        np.bincount(
+            np.searchsorted(edges, x),
+            None,
+            len(edges) + 1,
+        )
+        for x in (old, new)
+    ]
     return stability_index(counts[0], counts[1])
 
 

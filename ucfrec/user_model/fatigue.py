@@ -70,7 +70,11 @@ class MainTags:
         items, rewards = (values[:, :run] for values in history)
         tags = self.tags[items.clamp(min=0)]
         alike = (tags == tags[:, :1]) & (items >= 0) & self.liked(rewards)
-        return torch.where(alike.all(1) & (items.shape[1] >= run), tags[:, 0], -1)
+        return torch.where(
+            alike.all(1) & (items.shape[1] >= run),
+            tags[:, 0],
+            -1,
+        )
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,13 @@ class LoggedRuns:
     sessions: IntArray
 
     @classmethod
-    def of(cls, store: EpisodeStore, tags: MainTags, lags: int, most: int) -> "LoggedRuns":
+    def of(
+        cls,
+        store: EpisodeStore,
+        tags: MainTags,
+        lags: int,
+        most: int,
+    ) -> "LoggedRuns":
         """Steps of a view of a store of items: the first sessions of it, about `most` steps."""
         ends = np.cumsum(store.lengths)
         view = store.select(np.arange(int(np.searchsorted(ends, most)) + 1)[: len(ends)])

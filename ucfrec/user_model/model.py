@@ -85,8 +85,11 @@ class UserModel:
         if not path.exists():
             fatigue = calibration = None
             if reward.binary:
-                views, lags = (train, validation), reward.lags
-                fatigue = fit_fatigue(*(LoggedRuns.of(v, tags, lags, _MOST_STEPS) for v in views))
+                first_runs, later_runs = (
+                    LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS)
+                    for view in (train, validation)
+                )
+                fatigue = fit_fatigue(first_runs, later_runs)
             logged, held_out = (
                 LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
@@ -127,7 +130,11 @@ class UserModel:
         return self.reward if self.training_users is None else self.training_users[0]
 
     def expect(
-        self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
+        self,
+        states: Tensor,
+        history: Shown,
+        users: Tensor | None,
+        items: Tensor,
     ) -> Float64Array:
         """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
         slope, intercept = self.calibration
@@ -155,7 +162,13 @@ class LoggedRewards:
         self.values: Float64Array = values
         """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
         self._log_shares = np.log(counts / counts.sum())
-        self._slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
+        self._slopes = np.sinh(
+            np.linspace(
+                -8,
+                8,
+                801,
+            )
+        ) / max(float(np.ptp(values)), 1e-12)
         self._means = self._weigh(self._slopes) @ values
 
     def _weigh(self, slopes: Float64Array) -> Float64Array:

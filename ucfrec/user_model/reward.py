@@ -54,7 +54,12 @@ class UserPosterior(nn.Module):
         super()._load_from_state_dict(*arguments, **options)
         self.weigh(self.weight)
 
-    def forward(self, items: Tensor, vectors: Tensor, targets: Tensor) -> Tensor:
+    def forward(
+        self,
+        items: Tensor,
+        vectors: Tensor,
+        targets: Tensor,
+    ) -> Tensor:
         """Posterior means (B, D + 1) of level and affinity, times `weight`.
 
         Args:
@@ -63,7 +68,15 @@ class UserPosterior(nn.Module):
             targets: (B, N) what they earned, as `ItemRewardModel.target`.
         """
         valid, items = items >= 0, items.clamp(min=0)
-        inputs = F.pad(vectors[items], (1, 0), value=1.0) @ self.root * valid.unsqueeze(2)
+        inputs = (
+            F.pad(
+                vectors[items],
+                (1, 0),
+                value=1.0,
+            )
+            @ self.root
+            * valid.unsqueeze(2)
+        )
         unusual = (targets - self.usual[items]) * valid
         matrix = inputs.mT @ inputs + torch.eye(len(self.root), device=inputs.device)
         solution = _solution(matrix, inputs.mT @ unusual.unsqueeze(2)).squeeze(2)
@@ -152,7 +165,12 @@ class ItemRewardModel(nn.Module):
         """Items shown before a step that its expected reward depends on."""
         return max(self.lags, MEMORY) if self.tastes.are_known else self.lags
 
-    def scores(self, states: Tensor, history: Shown, users: Tensor | None = None) -> Tensor:
+    def scores(
+        self,
+        states: Tensor,
+        history: Shown,
+        users: Tensor | None = None,
+    ) -> Tensor:
         """Linear predictors of all items, (B, n_items): log-odds of the higher reward if there are
         two, otherwise rewards in standard deviations from their mean.
 
@@ -169,13 +187,24 @@ class ItemRewardModel(nn.Module):
         scores = scores.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
         return scores + self.level(states, users, tastes).unsqueeze(1)
 
-    def score(self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+    def score(
+        self,
+        states: Tensor,
+        history: Shown,
+        users: Tensor | None,
+        items: Tensor,
+    ) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
         return self.score_without_state(history, users, items) + x @ self.state + added
 
-    def score_without_state(self, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+    def score_without_state(
+        self,
+        history: Shown,
+        users: Tensor | None,
+        items: Tensor,
+    ) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
         earlier, repeated, alike = self.exposures(history)
         column, user_rows = items.unsqueeze(1), self._user_rows(users, items)
@@ -185,13 +214,23 @@ class ItemRewardModel(nn.Module):
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
         return self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
 
-    def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+    def level(
+        self,
+        states: Tensor,
+        users: Tensor | None,
+        tastes: Tensor,
+    ) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
         `tastes_after` (B, D + 1)."""
         of_user = self.user[self._user_rows(users, states)] + tastes[:, 0]
         return of_user + self.standardise(states) @ self.state
 
-    def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+    def query(
+        self,
+        states: Tensor,
+        users: Tensor | None,
+        tastes: Tensor,
+    ) -> Tensor:
         """What multiplies the vector of every item, (B, D); the arguments are those of `level`."""
         interaction = self.standardise(states) @ self.interaction
         return self.affinity[self._user_rows(users, states)] + tastes[:, 1:] + interaction

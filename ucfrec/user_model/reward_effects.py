@@ -86,7 +86,10 @@ class Design:
 
     @classmethod
     def of(
-        cls, model: ItemRewardModel, rows: RewardRows, weights: Tensor | None = None
+        cls,
+        model: ItemRewardModel,
+        rows: RewardRows,
+        weights: Tensor | None = None,
     ) -> "Design":
         """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
         likeness, last = model.likeness, len(model.user) - 1
@@ -218,7 +221,10 @@ class Design:
 
 
 def fit_effects(
-    design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
+    design: Design,
+    start: Effects,
+    spreads: Mapping[str, float],
+    fixed: Effects | None = None,
 ) -> Effects:
     """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`, from
     `start`, or 0; `fixed` effects are part of the predictor, and of the result, as they are."""
@@ -293,7 +299,12 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
     return result
 
 
-def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
+def _scale(
+    design: Design,
+    name: str,
+    curvature: float,
+    penalty: float,
+) -> tuple[_Map, _Map]:
     """Maps of an effect to units in which the objective is about evenly curved, and back."""
     if name in ("state", "exposure"):
         factor, inverse = _factors(curvature * _moments(design, design.inputs(name)), penalty)
@@ -333,7 +344,12 @@ class Beginning:
     """Its effects; those of new users and items are 0."""
 
     @classmethod
-    def of(cls, folder: Path | None, name: str, design: Design) -> "Beginning":
+    def of(
+        cls,
+        folder: Path | None,
+        name: str,
+        design: Design,
+    ) -> "Beginning":
         """Read what `EffectSearch.save` wrote, if there is any, in the sizes of `design`."""
         effects = Effects()
         if folder is None or not (file := folder / name).exists():
@@ -362,7 +378,12 @@ class EffectSearch:
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
     """For new users: the model, whose `tastes` are set, and what training and held-out rows saw."""
 
-    def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
+    def __init__(
+        self,
+        design: Design,
+        held_out: Design | None,
+        begin: Beginning,
+    ) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""
         if held_out is None:
             rows = len(design.items)
@@ -486,7 +507,10 @@ class EffectSearch:
         )
 
     def _find_best(
-        self, name: str, number: int, strides: tuple[int, ...]
+        self,
+        name: str,
+        number: int,
+        strides: tuple[int, ...],
     ) -> tuple[int, Effects, Tensor]:
         """Number of the best spread of the effect `name` near `number`, the fit, and its losses."""
         fits: dict[int, tuple[Effects, Tensor]] = {}
@@ -513,7 +537,12 @@ class EffectSearch:
         loss(number)
         return number, *fits[number]
 
-    def save(self, file: Path, model: ItemRewardModel, report: Any) -> None:
+    def save(
+        self,
+        file: Path,
+        model: ItemRewardModel,
+        report: Any,
+    ) -> None:
         """Write the model with the effects found, its report, and the effects beside it; `file` is
         complete last."""
         model.set_effects(self.effects, self.design.sum_content)

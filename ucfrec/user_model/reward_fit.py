@@ -137,7 +137,10 @@ def fit_item_reward_model(
 
 
 def refit_item_reward_model(
-    first: Path, store: EpisodeStore, folder: Path, seed: int
+    first: Path,
+    store: EpisodeStore,
+    folder: Path,
+    seed: int,
 ) -> ItemRewardModel:
     """Fit the effects that `fit_item_reward_model` kept in the folder `first`, as strong as there,
     to other rows of the view `store`."""
@@ -164,7 +167,11 @@ def refit_item_reward_model(
 
 
 def fit_training_users(
-    train: EpisodeStore, folder: Path, seed: int, weighted: bool = True, first: Path | None = None
+    train: EpisodeStore,
+    folder: Path,
+    seed: int,
+    weighted: bool = True,
+    first: Path | None = None,
 ) -> tuple[ItemRewardModel, TrainingUsersReport]:
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
@@ -202,7 +209,10 @@ def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:
 
 
 def set_statistics(
-    model: ItemRewardModel, rows: RewardRows, held_out: RewardRows, states: ItemStates
+    model: ItemRewardModel,
+    rows: RewardRows,
+    held_out: RewardRows,
+    states: ItemStates,
 ) -> None:
     """Set the normalisation of states, rewards and embeddings from the training rows."""
     for name, part in (("training", rows), ("held-out", held_out)):

@@ -49,13 +49,25 @@ class RewardRows:
         return len(self.items)
 
     @classmethod
-    def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
+    def of(
+        cls,
+        view: EpisodeStore,
+        lags: int,
+        limit: int,
+        seed: int,
+    ) -> "RewardRows":
         """All steps of a view of a store of items; of more than `limit`, so many drawn."""
         episodes, steps = draw_steps(view, limit, seed)
         return cls.at(view, episodes, steps, lags)
 
     @classmethod
-    def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
+    def at(
+        cls,
+        view: EpisodeStore,
+        episodes: IntArray,
+        steps: IntArray,
+        lags: int,
+    ) -> "RewardRows":
         """The given steps (M,) of a view, with the latest `lags` items shown before them."""
         states = torch.empty(len(steps), view.state_size)
         for start in range(0, len(steps), _READ_AT_ONCE):
@@ -102,7 +114,10 @@ def mean_gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
 
 
 def weigh_by_propensity(
-    view: EpisodeStore, episodes: IntArray, steps: IntArray, items: int
+    view: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+    items: int,
 ) -> Tensor | None:
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
@@ -170,7 +185,12 @@ class ItemRewardReport:
 def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     """Linear predictors (M,) of the items shown in `rows`."""
     scores = [
-        model.score(rows.states[part], rows.history.at(part), rows.users[part], rows.items[part])
+        model.score(
+            rows.states[part],
+            rows.history.at(part),
+            rows.users[part],
+            rows.items[part],
+        )
         for part in torch.split(torch.arange(len(rows)), _CHUNK)
     ]
     return torch.cat(scores)
@@ -184,7 +204,12 @@ def calibration_error(predicted: Float64Array, observed: Float64Array) -> float:
     return float(np.abs(off).sum()) / len(order)
 
 
-def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
+def fit_line(
+    scores: Tensor,
+    target: Tensor,
+    binary: bool,
+    weights: Tensor | None = None,
+) -> Line:
     """Slope and intercept of the scores (M,) that fit the target (M,) best: by logistic regression
     if it is `binary`, otherwise by least squares."""
     from sklearn.linear_model import LinearRegression, LogisticRegression
@@ -215,7 +240,11 @@ class UserCalibration:
 
     @classmethod
     def fit(
-        cls, model: ItemRewardModel, view: EpisodeStore, limit: int, seed: int
+        cls,
+        model: ItemRewardModel,
+        view: EpisodeStore,
+        limit: int,
+        seed: int,
     ) -> "UserCalibration":
         """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
         episodes, steps = draw_steps(view, limit, seed)

@@ -59,7 +59,12 @@ class LoggedEnds:
 
     @classmethod
     def of(
-        cls, store: EpisodeStore, likeness: Likeness, lags: int, most: int, seed: int
+        cls,
+        store: EpisodeStore,
+        likeness: Likeness,
+        lags: int,
+        most: int,
+        seed: int,
     ) -> "LoggedEnds":
         """Steps of a view, at most `most` of them, drawn at random; without the last one of a
         session that is not terminated, where the log may simply have ended."""
@@ -151,7 +156,11 @@ class SessionEnd:
 
     @classmethod
     def fit(
-        cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
+        cls,
+        likeness: Likeness,
+        logged: LoggedEnds,
+        held_out: LoggedEnds,
+        seed: int,
     ) -> tuple["SessionEnd", SessionEndReport]:
         """Fit every kind to logged steps, and keep the best on held-out ones: without the ends of
         users' last sessions, which may only be those of their rows, if that clearly (by three
@@ -169,7 +178,11 @@ class SessionEnd:
 
     @classmethod
     def _fit_best(
-        cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
+        cls,
+        likeness: Likeness,
+        logged: LoggedEnds,
+        held_out: LoggedEnds,
+        seed: int,
     ) -> tuple["SessionEnd", SessionEndReport]:
         inputs, ended = logged.inputs, logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
@@ -192,14 +205,22 @@ class SessionEnd:
         return F.softplus(signed.clamp(max=_HIGHEST))
 
     def probabilities(
-        self, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
+        self,
+        history: Shown,
+        items: Tensor,
+        rewards: Float64Array,
+        steps: IntArray,
     ) -> Float64Array:
         """Probabilities (M,) that sessions end with a step; see `describe_steps`."""
         inputs = describe_steps(self._likeness, history, items, rewards, steps)
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
     def score_items(
-        self, history: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
+        self,
+        history: Shown,
+        items: Tensor,
+        rewards: Sequence[Tensor],
+        steps: Tensor,
     ) -> list[Tensor]:
         """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
         each of some rewards (B, C)."""
@@ -251,7 +272,11 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
 
 
 def describe_steps(
-    likeness: Likeness, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
+    likeness: Likeness,
+    history: Shown,
+    items: Tensor,
+    rewards: Float64Array,
+    steps: IntArray,
 ) -> Tensor:
     """(M, F) inputs of steps at which items (M,) were shown, after what was shown before."""
     alike = compare_to_history(likeness, history.padded(_LAGS).items, items)
@@ -260,7 +285,12 @@ def describe_steps(
     return torch.stack(columns, -1)
 
 
-def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> list[Tensor]:
+def _columns(
+    alike: Tensor,
+    repeated: Tensor,
+    rewards: Tensor,
+    steps: Tensor,
+) -> list[Tensor]:
     """F inputs (M, ...) from likeness (M, 10, ...) and repetition (M, L, ...), latest first."""
     numbers = steps.double().expand(rewards.shape)
     alike = (alike.double() / _STEP).round() * _STEP
@@ -276,7 +306,13 @@ class BoostedTrees:
     """The sum of T regression trees of at most S splits, as tables: which of its splits' inputs are
     at most their threshold selects a tree's leaf."""
 
-    def __init__(self, inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
+    def __init__(
+        self,
+        inputs: Tensor,
+        thresholds: Tensor,
+        leaves: Tensor,
+        base: Tensor,
+    ) -> None:
         """From int64 numbers of the splits' `inputs` (T, S) and, float64, their `thresholds`
         (T, S), the `base` () of the sum, and `leaves` (T, 2^S) by numbers whose bit s is set where
         split s finds an input that is at most its threshold."""

@@ -32,7 +32,8 @@ class Ope(Table):
             print(f"do not rely on the estimate: {reason}")
         value = "no estimate" if result.value is None else f"{result.value:.4g}"
         if result.interval is not None:
-            value += " [{:.4g}, {:.4g}]".format(*result.interval)
+            low, high = result.interval
+            value += f" [{low:.4g}, {high:.4g}]"
         print(f"discounted returns of an episode, γ = {self.discount:g}")
         print(f"policy        {value}, by fitted Q evaluation")
         print(f"behaviour     {result.behaviour:.4g}, logged")

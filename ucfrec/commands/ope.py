@@ -318,7 +318,7 @@ def _describe_ranking(ranking: "Ranking") -> str:
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.reporting.tables import format_rows
 
-    columns = ranking.shown
+    columns = ranking.headings
     rows = [{**dict.fromkeys(columns), "policy": row.method, **row.metrics} for row in ranking]
     conditions = ranking.rows[0].conditions
     lines = [format_rows(rows, ("policy", *columns)), ""]

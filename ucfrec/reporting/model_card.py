@@ -119,7 +119,7 @@ def add_ranking(
     remarks: Sequence[str] = (),
 ) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
-    values = _select_values(row, Ranking.shown, row.details["intervals"])
+    values = _select_values(row, Ranking.headings, row.details["intervals"])
     of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
     of += f", liked: {row.conditions['liked']}"
     add_measurement(run, "ucfrec rank", of, values, remarks)

@@ -270,7 +270,7 @@ class ResultTable:
     rows: Sequence[ResultRow]
     warnings: Sequence[str]
     """What makes the numbers less reliable."""
-    shown: ClassVar[tuple[str, ...]] = ()
+    headings: ClassVar[tuple[str, ...]] = ()
     """Columns of the table, after `method`; empty for those of the rows' own metrics."""
 
     def __iter__(self) -> Iterator[ResultRow]:
@@ -334,7 +334,7 @@ class ResultTable:
 
     def _table(self) -> "pd.DataFrame":
         frame = self.to_frame()
-        columns = self.shown or self._list_metrics()
+        columns = self.headings or self._list_metrics()
         return frame[["method", *(name for name in columns if name in frame)]]
 
     def _repr_html_(self) -> str:
@@ -345,13 +345,21 @@ class ResultTable:
 class Evaluation(ResultTable):
     """Returns in a simulator, one row per policy."""
 
-    shown = ("R_cum", "R_cum_low", "R_cum_high", "R_avg_pooled", "length", "coverage", "diversity")
+    headings = (
+        "R_cum",
+        "R_cum_low",
+        "R_cum_high",
+        "R_avg_pooled",
+        "length",
+        "coverage",
+        "diversity",
+    )
 
 
 class Ranking(ResultTable):
     """How policies and baselines rank what users were shown and liked later."""
 
-    shown = (
+    headings = (
         *("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate"),
         "coverage",
     )

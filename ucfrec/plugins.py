@@ -8,11 +8,11 @@ policies (classes derived from `ucfrec.policies.base.SequencePolicy`) in `ucfrec
 
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import Any
 
 from ucfrec.errors import InputError
 
-_ONE_OF: Final = {
+_ONE_OF = {
     "benchmarks": ("benchmark", "ucfrec.benchmark.suite", "Benchmark"),
     "datasets": ("dataset", "ucfrec.logs.mapping", "Dataset"),
     "policies": ("policy", "builtins", "object"),

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
@@ -24,9 +24,9 @@ FIRST_LINE = 10.0
 """Seconds before the first line of progress without a terminal; a shorter job prints nothing."""
 NEXT_LINE = 30.0
 """Seconds between lines."""
-_AGAIN: Final = 0.1
+_AGAIN = 0.1
 """Seconds after which an interruption that a library swallowed is raised again."""
-_BLAS: Final = 128 * 2**20
+_BLAS = 128 * 2**20
 """Bytes that OpenBLAS asks the operating system for at its first use, and some more."""
 _LABEL: ContextVar[str] = ContextVar("label", default="")
 """Which of several jobs at the same time this is; empty for the only one."""

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final
+from typing import Any
 
-_PACKAGES: Final = ("ucfrec", "torch", "numpy", "gymnasium")
+_PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium")
 
 
 def versions(packages: Sequence[str] = ()) -> dict[str, str]:

@@ -39,7 +39,7 @@ from ucfrec.errors import InputError
 
 Table = TypeVar("Table")
 # Strict: `true` and "1" are not accepted as numbers; an int is accepted as a float.
-_CONFIG: Final = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+_CONFIG = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 """A number of updates, rows or episodes, at least 1."""
@@ -187,7 +187,7 @@ LARGEST_SEED: Final = 2**32 - 1
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 _Value = TypeVar("_Value")
-_WRITTEN: Final = (str, bytes, int, float, np.generic, list, tuple, set, dict, type(None))
+_WRITTEN = (str, bytes, int, float, np.generic, list, tuple, set, dict, type(None))
 """Kinds of values that messages write out."""
 
 

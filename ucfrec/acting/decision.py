@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import torch
@@ -18,13 +18,13 @@ from ucfrec.settings import Share, Weight, settings_table
 
 _Return = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Items = Annotated[int, Field(ge=1, le=10**9)]
-_COLDEST: Final = 1e-30
+_COLDEST = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
-_LAST: Final = -1e40
+_LAST = -1e40
 """Log-probability below those of float32: of items that are drawn once no others are left."""
-_FEW: Final = 2**16
+_FEW = 2**16
 """Scores up to which looking for blocks first costs more."""
-_BLOCK: Final = 128
+_BLOCK = 128
 """Items of the smallest block; maxima of fewer cost more."""
 
 

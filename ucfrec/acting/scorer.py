@@ -8,7 +8,7 @@ import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from ucfrec.user_model.fatigue import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
 
-_LOOKED_AT: Final = 64
+_LOOKED_AT = 64
 """Items of a decision that a lookahead asks about."""
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import product
 from operator import attrgetter
 from statistics import median_high
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,30 +32,30 @@ from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
 from ucfrec.user_model.reward_report import number_users
 
-_LOGGED_STEPS: Final = 10_000, 1000
+_LOGGED_STEPS = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
-_FINALISTS: Final = 8
+_FINALISTS = 8
 """Rules that are simulated again where users differ in their tastes, …"""
-_TIMES: Final = 4
+_TIMES = 4
 """… in so many times the sessions: few sessions there say as much of the users as of the rules."""
-_FEWEST: Final = 10
+_FEWEST = 10
 """Sessions of a half of the users that can disagree, and that can rule a candidate out."""
 _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
 """One in so many of the sessions are simulated before candidates so many standard errors behind the
 best are ruled out."""
-_SEED_OF_REST: Final = 3
+_SEED_OF_REST = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_FAR_OFF: Final = 0.1
+_FAR_OFF = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
-_LARGEST_ERROR: Final = _FAR_OFF / 4
+_LARGEST_ERROR = _FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
-_WIDEST: Final = 0.4
+_WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
-_ROWS_AT_ONCE: Final = 256
+_ROWS_AT_ONCE = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
-_SCORES_AT_ONCE: Final = 2**24
+_SCORES_AT_ONCE = 2**24
 """Most scores of a forward pass, rows × items: 64 MiB."""
-_NEAR_THE_LOG: Final = (
+_NEAR_THE_LOG = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
 )
@@ -126,12 +126,7 @@ def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:
     batches of about `_ROWS_AT_ONCE` rows, or as many as one part."""
     numbers, first = np.unique(rules, return_index=True)
     batches, size = [list[tuple[int, slice]]()], 0
-    for rule, begin, end in zip(
-        numbers,
-        first,
-        [*first[1:], len(rules)],
-        strict=True,
-    ):
+    for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
         for start in range(int(begin), int(end), most):
             stop = min(start + most, int(end))
             if size and size + stop - start > min(_ROWS_AT_ONCE, most):

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from importlib import import_module, metadata
-from typing import Any, Final
+from typing import Any
 
 from ucfrec import __version__
 from ucfrec.commands.options import Table, add_options
@@ -164,15 +164,13 @@ def _extra_with(module: str) -> str | None:
     return min(suitable, key=lambda extra: sizes[extra], default=None)
 
 
-_NO_MEMORY: Final = (
+_NO_MEMORY = (
     "DefaultCPUAllocator|std::bad_alloc|out of memory|Out of Memory|[cC]annot allocate memory|"
     "can't start new thread|failed to map segment|could not allocate|malloc of size|"
     "could not create a primitive"
 )
 """How libraries that raise other errors than `MemoryError` say that there is no memory."""
-_NO_SPACE: Final = (
-    "No space left on device|Disk quota exceeded|File too large|disk is full|disk I/O error"
-)
+_NO_SPACE = "No space left on device|Disk quota exceeded|File too large|disk is full|disk I/O error"
 """How libraries that raise other errors than `OSError` say that a disk is full."""
 
 

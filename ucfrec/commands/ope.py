@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
 from ucfrec.commands.shared_options import (
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
-_ESTIMATED: Final = Group("what is estimated")
+_ESTIMATED = Group("what is estimated")
 
 
 class Ope(RuleOptions, LogOptions):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, POSITIVE, Group, Table, settings_given
 from ucfrec.commands.shared_options import AnswerOptions
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from ucfrec.recommending.responder import Responder
     from ucfrec.recommending.server import Parent
-_STOPPED: Final = "ucfrec serve: stopped"
-_SERVER: Final = Group("the server")
-_OWN_NAMES: Final = ("localhost", "127.0.0.1", "::1")
+_STOPPED = "ucfrec serve: stopped"
+_SERVER = Group("the server")
+_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
 class Serve(AnswerOptions):

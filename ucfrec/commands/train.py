@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table, read_docstrings
 from ucfrec.errors import InputError, InputNote
@@ -19,7 +19,7 @@ from ucfrec.policies.registry import policy_names
 if TYPE_CHECKING:
     from ucfrec.runs.record import RunRecord
 
-_WIDEST: Final = 160
+_WIDEST = 160
 """Most terminal columns of a line."""
 
 

@@ -47,7 +47,7 @@ CRM: Final = "crm"
 """Folder of the reward model."""
 MODELS: Final = ("item-reward", CRM, "csg")
 """Folders of the checkpoints of `augment_episodes`, as far as the settings need them."""
-_CPU: Final = torch.device("cpu")
+_CPU = torch.device("cpu")
 _CHUNK, _ACTION_CHUNK = 8192, 4096
 _ACTION_STREAM = 1
 """Keeps the draws of actions apart from others with the same seed."""
@@ -264,12 +264,7 @@ def edit_states(
             proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
             factual, z = (
-                replace(
-                    factual,
-                    states=s,
-                    actions=a,
-                    rewards=r,
-                ),
+                replace(factual, states=s, actions=a, rewards=r),
                 exact.abduct(s, a, r),
             )
             proposals = proposed.double()
@@ -488,21 +483,7 @@ class ActionGenerator:
             factual = read_transitions(view, at[0], at[1], self.item_rewards).to(self.crm.device)
             s, a, r = (v.double() for v in (factual.states, factual.actions, factual.rewards))
             z = exact.abduct(s, a, r)
-            reproduced = (
-                (
-                    (
-                        exact.predict(
-                            s,
-                            a,
-                            z,
-                        )
-                        - r
-                    ).abs()
-                    <= self.epsilon_r
-                )
-                .cpu()
-                .numpy()
-            )
+            reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
             labels = self.clusters.nearest(self.crm.normalise_states(factual.states).cpu()).numpy()
             rows = np.repeat(np.arange(len(drawn_at)), count)
             actions, drawable = self.support.draw(labels[rows], rng)
@@ -512,15 +493,7 @@ class ActionGenerator:
             changed = read_transitions(
                 view, at[0][rows], at[1][rows], self.item_rewards, actions
             ).actions
-            predicted = (
-                exact.predict(
-                    s[rows],
-                    changed.to(s),
-                    z[rows],
-                )
-                .cpu()
-                .numpy()
-            )
+            predicted = exact.predict(s[rows], changed.to(s), z[rows]).cpu().numpy()
             return drawn_at[rows], actions, predicted, reproduced[rows]
 
         chunks = map(predict, range(0, max(1, len(steps)), _ACTION_CHUNK))

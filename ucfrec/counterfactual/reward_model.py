@@ -425,16 +425,7 @@ def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> _Rows:
     s, a, r = transitions.states, transitions.actions, transitions.rewards
     parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
     inputs = torch.cat([model.given(s[part], a[part]) for part in parts])
-    return inputs, torch.cat(
-        [
-            model.residual(
-                s[part],
-                a[part],
-                r[part],
-            )
-            for part in parts
-        ]
-    )
+    return inputs, torch.cat([model.residual(s[part], a[part], r[part]) for part in parts])
 
 
 def _fit(

@@ -153,17 +153,7 @@ def find_measurements(
             bar.update()
     # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return {
-        d: d in leaks
-        and (
-            len(leaks) == 1
-            or _measures(
-                data,
-                d,
-                leaks - {d},
-                seed,
-            )
-        )
-        for d in tested
+        d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, seed)) for d in tested
     }
 
 
@@ -224,11 +214,7 @@ def _measures(
         return False
     inputs = np.column_stack(
         [
-            np.delete(
-                data.columns,
-                [dimension, *without],
-                axis=1,
-            ),
+            np.delete(data.columns, [dimension, *without], axis=1),
             data.rest,
         ]
     )

@@ -130,11 +130,7 @@ class Likeness(nn.Module):
         places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
         gathered = nn.functional.pad(profile, (0, 1)).gather(
             2,
-            places.expand(
-                -1,
-                shape[1],
-                -1,
-            ),
+            places.expand(-1, shape[1], -1),
         )
         return gathered.view((*shape, tags.shape[2])).sum(3)
 

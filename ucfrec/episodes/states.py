@@ -92,11 +92,7 @@ class ItemStates:
         items = F.pad(self.embeddings.float(), (0, 0, 0, 1))
         object.__setattr__(self, "_items", items)
         object.__setattr__(self, "embeddings", items[:-1])
-        object.__setattr__(
-            self,
-            "_users",
-            F.pad(self.user_features.float(), (0, 0, 0, 1)),
-        )
+        object.__setattr__(self, "_users", F.pad(self.user_features.float(), (0, 0, 0, 1)))
         decays = [self.decay**lag for lag in reversed(range(self.window))]
         object.__setattr__(self, "_decays", torch.tensor(decays))
 

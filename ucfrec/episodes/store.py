@@ -34,9 +34,9 @@ __all__ = ["ITEM_STATES", "EpisodeStore"]
 LONGEST_HISTORY: Final = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 _STATISTICS_STEPS = 100_000
-_FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
-_PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
-_LISTS: Final = (schema.OBSERVATION, schema.ACTION)
+_FILES = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
+_PLAIN = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
+_LISTS = (schema.OBSERVATION, schema.ACTION)
 
 
 class EpisodeStore(EpisodeView):

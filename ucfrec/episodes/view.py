@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Transitions, Windows, list_earlier
 from ucfrec.errors import InputError
 
-_DTYPES: Final = {
+_DTYPES = {
     schema.OFFSETS: "<i8",
     schema.RETURN_TO_GO: "<f4",
     **schema.STEP_DTYPES,

@@ -9,7 +9,7 @@ asked for.
 """
 
 from collections.abc import Collection, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,9 @@ from ucfrec.results.statistics import group_auc
 from ucfrec.schema import ITEM_ID, USER_ID
 from ucfrec.settings import require_whole
 
-_RANK: Final = "rank"
-_PAIR: Final = [USER_ID, ITEM_ID]
-_NUMBERS: Final = ("integer", "floating", "mixed-integer-float", "integer-na", "decimal", "boolean")
+_RANK = "rank"
+_PAIR = [USER_ID, ITEM_ID]
+_NUMBERS = ("integer", "floating", "mixed-integer-float", "integer-na", "decimal", "boolean")
 """What pandas calls the types of ids that are equal where their values are."""
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +29,7 @@ from ucfrec.results.statistics import group_auc, resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
-_ROWS: Final = "steps"
+_ROWS = "steps"
 
 
 def describe_liked(states: ItemStates) -> str:

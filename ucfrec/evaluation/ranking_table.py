@@ -50,11 +50,11 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 SUITE: Final = "rank"
 """Suite of the rows."""
 METRIC: Final = "hit_rate_liked"
-_OTHERWISE: Final = "hit_rate_shown"
+_OTHERWISE = "hit_rate_shown"
 """Metric of rows on logs in which nothing is liked."""
-_KNN_HISTORY: Final = 20
+_KNN_HISTORY = 20
 """Latest rows of the user that item-kNN reads."""
-_ALS_FACTORS: Final = 32
+_ALS_FACTORS = 32
 
 
 class PolicyRanker:

@@ -20,10 +20,10 @@ from ucfrec.recommending.recommend import recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 PARTS: Final = ("policy", "exposure", "reward weight", "lookahead")
-_ALMOST_NONE: Final = 1e-9
+_ALMOST_NONE = 1e-9
 """A lookahead that changes no score, but has rewards counted in the units of a lookahead."""
-_EXCLUDED: Final = 10
-_MOST_ROWS: Final = 1000
+_EXCLUDED = 10
+_MOST_ROWS = 1000
 
 
 @dataclass(frozen=True)

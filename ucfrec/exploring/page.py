@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,12 +29,12 @@ from ucfrec.reporting.page import render_report, template
 from ucfrec.reporting.results import find_quoted, read_evidence
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-_PACKAGE: Final = "ucfrec.exploring"
-_TITLES: Final = ("title", "name")
-_IMAGES: Final = ("image", "image_url", "picture")
-_USERS_LISTED: Final = 1000
-_MOST_ITEMS: Final = 100
-_HEADERS: Final = {
+_PACKAGE = "ucfrec.exploring"
+_TITLES = ("title", "name")
+_IMAGES = ("image", "image_url", "picture")
+_USERS_LISTED = 1000
+_MOST_ITEMS = 100
+_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'unsafe-inline'; "
         "img-src http: https:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"

@@ -25,13 +25,13 @@ from ucfrec.errors import InputError
 
 LOCK: Final = ".ucfrec-lock"
 SCRATCH: Final = ".ucfrec-partial"
-_CHECKSUM: Final = "checksum"
+_CHECKSUM = "checksum"
 """Entry of a JSON object with the checksum of its other entries."""
-_PATIENCE: Final = 0.5
+_PATIENCE = 0.5
 """Seconds before a claim is given up: another process may just be removing a dead one."""
-_COMMAND_LENGTH: Final = 160
-_LARGEST_JSON: Final = 2**30
-_LARGEST_TOML: Final = 2**24
+_COMMAND_LENGTH = 160
+_LARGEST_JSON = 2**30
+_LARGEST_TOML = 2**24
 
 _held: set[tuple[int, Path]] = set()
 """(process, path) of the claims that are held; a fork holds none of its parent's."""

@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_FEW_ROWS: Final = 1_000_000
-_ROWS_PER_BYTE: Final = 10
-_LARGE: Final = 2**28
+_FEW_ROWS = 1_000_000
+_ROWS_PER_BYTE = 10
+_LARGE = 2**28
 """Bytes to which any gzip file may unfold."""
-_RATIO: Final = 100
+_RATIO = 100
 """Bytes to which a byte of a larger one may: logs with an id and a time a row reach 20."""
-_DEFLATE: Final = 1032
+_DEFLATE = 1032
 """Most bytes to which gzip can unfold one."""
-_BLOCK: Final = 2**20
-_REMEDY: Final = "restore it, or make the store or run again"
-_NO_THREAD: Final = "Failed to launch worker thread"
+_BLOCK = 2**20
+_REMEDY = "restore it, or make the store or run again"
+_NO_THREAD = "Failed to launch worker thread"
 """How Arrow says that there is no memory for the stack of a thread."""
 
 

@@ -35,8 +35,8 @@ CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
 RUN_RECORD: Final = "run.json"
 """Record of a run."""
-_THREADS: Final = 2
-_LARGEST: Final = 2**48
+_THREADS = 2
+_LARGEST = 2**48
 SMALL: Final = 2**26
 """Bytes of a file that is always read to check it."""
 Text = InstanceOf[str]

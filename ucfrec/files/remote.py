@@ -21,9 +21,9 @@ from typing import Any, Final
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 
-_URI: Final = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://.+")
-_BLOCK: Final = 2**22
-_SPARE: Final = 0.9
+_URI = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://.+")
+_BLOCK = 2**22
+_SPARE = 0.9
 """Share of the free disk that copies may take."""
 RECORDS: Final = ("meta.json", "run.json")
 """Files that make a folder a store or a run; they are copied last."""

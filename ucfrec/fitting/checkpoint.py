@@ -19,10 +19,10 @@ from ucfrec.files.atomic import atomic_file, json_text, require_file
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
 METRICS: Final = "metrics.jsonl"
-_STEP: Final = "step"
-_LARGEST_STEP: Final = 2**53
+_STEP = "step"
+_LARGEST_STEP = 2**53
 """The largest range of integers that floats represent exactly."""
-_LINE: Final = TypeAdapter(dict[str, Annotated[float, Field(strict=True)] | None])
+_LINE = TypeAdapter(dict[str, Annotated[float, Field(strict=True)] | None])
 _Module = TypeVar("_Module", bound=nn.Module)
 
 

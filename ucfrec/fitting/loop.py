@@ -21,10 +21,10 @@ from ucfrec.processes import progress, random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
-_OPTIMIZER: Final = "optimizer."
-_AVERAGE: Final = "average."
+_OPTIMIZER = "optimizer."
+_AVERAGE = "average."
 """Start of the names of averages in a checkpoint."""
-_WHEN: Final = ".when"
+_WHEN = ".when"
 """End of the name of when each row of a table was last averaged."""
 
 

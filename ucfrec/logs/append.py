@@ -35,10 +35,10 @@ from ucfrec.processes import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
-_FILL: Final = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
+_FILL = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
-_DENSER: Final = 20
-_LATEST: Final = 210_000
+_DENSER = 20
+_LATEST = 210_000
 """Number of the latest rows of a log among which its end is looked for."""
 
 

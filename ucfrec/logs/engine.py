@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 BATCH_ROWS: Final = 2**17
 """Most rows of a batch read from DuckDB."""
-_BESIDE: Final = 370 * 2**20
+_BESIDE = 370 * 2**20
 """Bytes that going through rows takes beside the engine and what the process has already."""
-_CLOSED: Final = {
+_CLOSED = {
     "allow_community_extensions": False,
     "allow_persistent_secrets": False,
     "autoinstall_known_extensions": False,
@@ -49,11 +49,11 @@ _CLOSED: Final = {
     # Otherwise SQL could read any Python variable as a table.
     "python_enable_replacements": False,
 }
-_OF_JOIN: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.PROPENSITY)
+_OF_JOIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.PROPENSITY)
 """Log columns that logs of `join` have."""
-_NAME: Final = re.compile(r"[^\W\d]\w*")
-_OF_ENGINE: Final = re.compile(r"[A-Z][A-Za-z ]+ Error: ")
-_DISK_FULL: Final = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
+_NAME = re.compile(r"[^\W\d]\w*")
+_OF_ENGINE = re.compile(r"[A-Z][A-Za-z ]+ Error: ")
+_DISK_FULL = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
 """In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
 

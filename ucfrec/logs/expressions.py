@@ -25,15 +25,15 @@ MAX_GROWTH: Final = 500
 """Most times by which text of an expression may be longer than the text of its columns."""
 MAX_SIZE: Final = 20_000
 """Most nodes of an expression as DuckDB evaluates it, counting each copy of copied arguments."""
-_MAX_TREE: Final = 2_000_000
+_MAX_TREE = 2_000_000
 """Most characters of the JSON of a syntax tree."""
-_MAX_COPIED: Final = 1_000_000
+_MAX_COPIED = 1_000_000
 """Most characters after `CASE x WHEN` copied x."""
-_MAX_QUOTED: Final = 120
+_MAX_QUOTED = 120
 """Most characters of an expression in a message."""
 
 _KINDS = "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
-_NODES: Final = frozenset(_KINDS.split())
+_NODES = frozenset(_KINDS.split())
 _SCALARS = """
     BOOLEAN BOOL LOGICAL TINYINT SMALLINT INTEGER BIGINT HUGEINT UTINYINT USMALLINT UINTEGER UBIGINT
     UHUGEINT INT1 INT2 INT4 INT8 SHORT LONG SIGNED UINT8 UINT16 UINT32 UINT64 FLOAT FLOAT4 FLOAT8
@@ -83,28 +83,28 @@ FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATOR
 """Allowed functions, and operators by the parser's names (~~ is LIKE)."""
 COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
 """Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
-_JOINING: Final = ("concat", "||", "list_concat", "list_cat", "list_append", "list_prepend")
+_JOINING = ("concat", "||", "list_concat", "list_cat", "list_append", "list_prepend")
 """What they return is as long as all their arguments together."""
-_QUOTING: Final = (
+_QUOTING = (
     *("string_split", "str_split", "string_split_regex"),
     *("json_extract", "json_extract_string", "->>"),
 )
 """What they return is longer than an argument once it is text: lists have quotes and commas."""
-_QUOTES: Final = 3
-_DATE_PARTS: Final = 12
+_QUOTES = 3
+_DATE_PARTS = 12
 """Characters for two of the format of `strftime`."""
-_TEXTS_AND_LISTS: Final = ("VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST")
-_PLACES: Final = ("query_location", "query_location_length")
-_SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
-_WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
-_ALLOWED: Final = (
+_TEXTS_AND_LISTS = ("VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST")
+_PLACES = ("query_location", "query_location_length")
+_SIMPLE_CASE = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
+_WHEN = re.compile(r"\bwhen\b", re.IGNORECASE)
+_ALLOWED = (
     "allowed are columns, literals, operators, casts, CASE, and the functions that "
     "docs/log-format.md lists"
 )
 
 
-_TOO_DEEP: Final = f"it is nested more than {MAX_NESTING} levels deep; simplify it"
-_TOO_LARGE: Final = f"it is too large; nest fewer of CASE x WHEN, {', '.join(sorted(COPYING))}"
+_TOO_DEEP = f"it is nested more than {MAX_NESTING} levels deep; simplify it"
+_TOO_LARGE = f"it is too large; nest fewer of CASE x WHEN, {', '.join(sorted(COPYING))}"
 
 
 class Expression(str):

@@ -35,7 +35,7 @@ from ucfrec.logs.tables import (
 if TYPE_CHECKING:
     from scipy import sparse
 
-_KINDS: Final = {
+_KINDS = {
     "DOUBLE": "numbers",
     "VARCHAR": "categories",
     "VARCHAR[]": "tags",
@@ -45,7 +45,7 @@ CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
-_MANY_LACKING: Final = 0.2
+_MANY_LACKING = 0.2
 """Share of the ids without a row above which a note says so."""
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 HISTORIES: Final = "histories"
 """Name of a data frame in messages and in the engine."""
-_UNREAD: Final = (
+_UNREAD = (
     pa.types.is_float16,
     pa.types.is_decimal256,
     pa.types.is_interval,

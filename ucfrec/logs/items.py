@@ -33,10 +33,10 @@ BLOCK_STEPS: Final = 2**19
 """Training steps in memory at a time, or more if one user has more."""
 EXPOSURE: Final = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
-_OVERSAMPLES: Final = 10
-_SMALL: Final = 1e-10
+_OVERSAMPLES = 10
+_SMALL = 1e-10
 """Eigenvalues below this share of the largest are rounding errors."""
-_ALIKE: Final = 0.5
+_ALIKE = 0.5
 """Share of items that two tags must have in common (Jaccard) to be the same tag."""
 
 

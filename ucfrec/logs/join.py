@@ -28,9 +28,9 @@ from ucfrec.logs.typed import WANTED, LogTables, type_columns
 
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
-_REQUEST: Final = schema.REQUEST_ID
-_KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
-_OTHERS: Final = {
+_REQUEST = schema.REQUEST_ID
+_KEYS = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+_OTHERS = {
     _REQUEST: "VARCHAR",
     schema.POSITION: "INTEGER",
     schema.PROPENSITY: "DOUBLE",
@@ -39,18 +39,18 @@ _OTHERS: Final = {
     schema.ARM: "VARCHAR",
 }
 """Columns of exposures besides the keys, and their DuckDB types."""
-_EXPOSURE: Final = (*_KEYS, *_OTHERS)
-_MEASURED: Final = (schema.TIMESTAMP, schema.PROPENSITY)
+_EXPOSURE = (*_KEYS, *_OTHERS)
+_MEASURED = (schema.TIMESTAMP, schema.PROPENSITY)
 """Columns that may differ where an exposure is written twice."""
-_ONE_EXPOSURE: Final = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
+_ONE_EXPOSURE = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
 """SQL of the columns that are equal where an exposure is written twice."""
-_SAME_KEY: Final = (
+_SAME_KEY = (
     "CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
     "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
 )
 """Whether feedback `f` and exposure `e` are of the same user and item."""
-_WRITE_NUMBERS: Final = "write numbers as 12.50, truth values as true and false"
-_DAY_MS: Final = 86_400_000
+_WRITE_NUMBERS = "write numbers as 12.50, truth values as true and false"
+_DAY_MS = 86_400_000
 
 
 @dataclass(frozen=True)

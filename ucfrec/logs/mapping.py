@@ -18,12 +18,12 @@ from ucfrec.logs.expressions import Expression
 from ucfrec.settings import nearest
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
-_OTHER_TABLES: Final = (
+_OTHER_TABLES = (
     *(".tsv", ".pq", ".jsonl", ".ndjson", ".orc", ".avro", ".feather", ".arrow", ".xlsx"),
     *(".csv.bz2", ".csv.zip", ".csv.zst", ".csv.xz", ".tar.gz", ".zip"),
 )
 """Endings of files beside logs that may be meant to be read."""
-_CONVERT: Final = "convert it to Parquet or CSV, or give it one of the endings that are read"
+_CONVERT = "convert it to Parquet or CSV, or give it one of the endings that are read"
 KEY_COLUMNS: Final = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
 OPTIONAL_COLUMNS: Final = (
     schema.OBSERVATION,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import pyarrow as pa
 from pydantic import Field, InstanceOf
@@ -36,7 +36,7 @@ from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
 
-_REMEMBERED: Final = ("duplicates", "dataset", "min_steps", "max_session")
+_REMEMBERED = ("duplicates", "dataset", "min_steps", "max_session")
 """Options that the record of a store has."""
 
 

@@ -39,7 +39,7 @@ USERS_FILE: Final = "users.parquet"
 EPISODE_USERS: Final = "episode_users.parquet"
 ID_TABLES: Final = ((schema.USER_ID, "users", USERS_FILE), (schema.ITEM_ID, "items", ITEMS_FILE))
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
-_BINS: Final = 2**16
+_BINS = 2**16
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ MEMORY: Final = "2GB"
 """Memory of the process of a task."""
 PART_ROWS: Final = 1_000_000
 """About so many rows are a part; a user's rows are never in two."""
-_TYPES: Final = {
+_TYPES = {
     "BIGINT": "bigint",
     "VARCHAR": "string",
     schema.ACTION: "array<float>",
@@ -72,8 +72,8 @@ _TYPES: Final = {
     schema.IS_RANDOM: "boolean",
 }
 """DuckDB type of an id, or another log column, to Spark's type."""
-_SORTED: Final = "sorted"
-_REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
+_SORTED = "sorted"
+_REFUSED = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
 
 Work = Callable[[int, Path, LogMapping], int]
 """Takes the number of a part, the file of its rows and their columns; returns a count. The rows

@@ -41,15 +41,15 @@ FEW_IDS: Final = 20
 MOST_UNKNOWN: Final = 0.9
 """Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
 warning that they are unknown."""
-_NAMED: Final = 5
+_NAMED = 5
 """Users of the longest sessions that are named."""
-_CLOCK_HINT: Final = (
+_CLOCK_HINT = (
     "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000', "
     "microseconds with 'COLUMN / 1000', nanoseconds with 'COLUMN / 1000000', times such as "
     "20260131 with --time-format; for older times, say --earliest 1990-01-01, or earliest in the "
     "mapping"
 )
-_REMEDIES: Final = {
+_REMEDIES = {
     "null_key": "fill it in, or map another column",
     "clock_out_of_range": _CLOCK_HINT,
     "vector_not_finite": "correct the actions",

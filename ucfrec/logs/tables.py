@@ -35,9 +35,9 @@ _CSV_FAULT = re.compile(
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _MAX_FAULT = 300
 """Most characters of a message of DuckDB, which may quote values of any length."""
-_MOST_NESTED: Final = 32
+_MOST_NESTED = 32
 """Most levels of a Parquet column; a list is two, and DuckDB's time doubles with each list."""
-_NESTED_TOO_DEEP: Final = "schema too deeply nested"
+_NESTED_TOO_DEEP = "schema too deeply nested"
 """Arrow's words."""
 NOTHING: Final = '"NULL"'
 """DuckDB type of a column without any value."""
@@ -50,10 +50,10 @@ EXPOSED: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
 """Columns that together only exposures have, and logs that `join` made of them."""
 PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
 """Column in which pandas keeps the numbers of the rows of a frame: no data."""
-_NO_VALUE: Final = "__HIVE_DEFAULT_PARTITION__"
+_NO_VALUE = "__HIVE_DEFAULT_PARTITION__"
 """Value of a column in the name of a folder whose rows have none."""
-_FILE: Final = "ucfrec: file"
-_RAW: Final = "ucfrec: text of "
+_FILE = "ucfrec: file"
+_RAW = "ucfrec: text of "
 
 MAX_FLOAT = 3.4028235e38
 WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}

@@ -44,11 +44,11 @@ ROWS: Final = "read"
 WANTED: Final = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
 VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
-_BATCH_BYTES: Final = 2**25
-_IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
+_BATCH_BYTES = 2**25
+_IS_INTEGER = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
 """SQL of whether a text `x` is as the integer that it means is written."""
-_IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
-_TYPES: Final = {
+_IDS = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
+_TYPES = {
     **dict.fromkeys(_IDS, "VARCHAR"),
     schema.TIMESTAMP: "BIGINT",
     schema.ACTION: "FLOAT[]",
@@ -56,8 +56,8 @@ _TYPES: Final = {
     schema.PROPENSITY: "FLOAT",
     schema.IS_RANDOM: "BOOLEAN",
 }
-_DAY_OR_MONTH_FIRST: Final = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
-_OF_DAY: Final = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
+_DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
+_OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import first_and_more, is_number, open_tables, quote_name
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 
-_NORMAL: Final = 1.959964
+_NORMAL = 1.959964
 LEVEL: Final = 0.95
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
 MISMATCH: Final = 0.001
 """Below this p-value, the users were not drawn into the arms by the intended shares."""
-_LARGEST: Final = 1e100
+_LARGEST = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""
 
 

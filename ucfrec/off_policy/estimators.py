@@ -52,7 +52,7 @@ from ucfrec.results.statistics import effective_number
 SUITE: Final = "off-policy"
 """Suite of the result rows."""
 LOGGED: Final = "logged"
-_LEAST_RATIO: Final = 1e-12
+_LEAST_RATIO = 1e-12
 """Mean ratio of a position below which nothing is divided by it."""
 
 

@@ -24,9 +24,9 @@ import numpy as np
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
-_LARGEST: Final = 1e100
+_LARGEST = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
-_ROUNDING: Final = 1e-6
+_ROUNDING = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
 PAGE_MS: Final = 10
 """Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""

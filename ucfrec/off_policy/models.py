@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -131,7 +131,7 @@ def array_on_disk(shape: tuple[int, int]) -> Float32Array:
         return np.memmap(file, np.float32, "r+", shape=shape)
 
 
-_BEHAVIOR_FOLDS: Final = 3
+_BEHAVIOR_FOLDS = 3
 _MOST_ROWS = 20_000
 """Steps that a model is fitted on, drawn at random: it has some thousand weights."""
 _SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
@@ -303,7 +303,7 @@ Chunks = Callable[[], Iterator[tuple[Float32Array, Float32Array]]]
 """Reads the N steps in order, some at once: features (B, P) of state and logged action, the first
 of them 1, and (B, P) their mean over the evaluated policy's actions in the same states."""
 
-_RETURN_FOLDS: Final = 5
+_RETURN_FOLDS = 5
 _CLOSE = 1e-6
 _ROUNDS = 10
 """Regressions of FQE for each step of the longest session, unless they settle before."""

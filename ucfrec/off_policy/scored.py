@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -42,11 +41,11 @@ from ucfrec.off_policy.score import (
 from ucfrec.off_policy.verdict import MOST_LEFT_OUT
 from ucfrec.runs.trained_policy import ITEMS, RunOnWorkers, TrainedPolicy
 
-_BATCH_ROWS: Final = 2**18
-_TESTED_ROWS: Final = 2**20
+_BATCH_ROWS = 2**18
+_TESTED_ROWS = 2**20
 """About so many rows are looked for in the training data."""
-_KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
-_WEIGHED: Final = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
+_KEYS = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+_WEIGHED = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
 
 
 def evaluate_scored(

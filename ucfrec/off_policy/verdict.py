@@ -256,7 +256,7 @@ def identification_bounds(
 
 BEST_FIRST: Final = ("DR", "SNPDIS")
 """The estimator that a verdict is about: the first of these that there is."""
-_SEEN_REMOVED: Final = (
+_SEEN_REMOVED = (
     "such as seen items, which serve excludes without --keep-seen: evaluate with --filter-seen"
 )
 OTHERS_REMOVED: Final = (
@@ -264,7 +264,7 @@ OTHERS_REMOVED: Final = (
     "--filter-seen, seen items are left out already"
 )
 """Why logs may lack choices of a policy that is evaluated without seen items."""
-_DETECTED: Final = 1.96 + 0.84
+_DETECTED = 1.96 + 0.84
 """Standard errors in a lift that 80% of samples would find at 95% confidence."""
 
 

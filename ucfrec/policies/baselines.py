@@ -27,21 +27,21 @@ PRIOR: Final = 10.0
 """Steps at the mean rate that are added to every item's own."""
 HALF_LIVES: Final = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
 """Hours after which a row counts half; those that are tried."""
-_SMOOTHING: Final = 1.0
+_SMOOTHING = 1.0
 """Likes that are added to all items together."""
 _WITHIN = 0.999
 """Largest share of an action's range that the hyperbolic tangent of the head is to reach."""
 _ROWS = 1024
-_AT_ONCE: Final = 2**24
+_AT_ONCE = 2**24
 """Largest number of pairs of an item with a row, or with another item, in memory at once."""
 _HOTTEST = 64.0
 """Largest factor on the cosines of neighbours."""
 _HALVINGS = 30
-_MAX_ROWS: Final = 300_000
-_ROWS_AT_ONCE: Final = 4096
-_FOLDS: Final = 5
-_DECIMALS: Final = 3
-_SPLITS: Final = LEAVES - 1
+_MAX_ROWS = 300_000
+_ROWS_AT_ONCE = 4096
+_FOLDS = 5
+_DECIMALS = 3
+_SPLITS = LEAVES - 1
 
 _Scored = Literal["steps", "likes", "rate"]
 LikedOf = Callable[[EpisodeStore, Array], BoolArray]

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import torch
@@ -19,9 +18,9 @@ from ucfrec.policies.heads import VectorHead
 from ucfrec.user_model.reward import MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
-_CANDIDATES: Final = 512
+_CANDIDATES = 512
 """Number of logged action vectors to choose from."""
-_PAIRS: Final = 2**15
+_PAIRS = 2**15
 """Pairs of state and action that are evaluated at once."""
 
 

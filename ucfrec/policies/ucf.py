@@ -26,7 +26,7 @@ from ucfrec.policies.base import (
 from ucfrec.policies.heads import ItemHead
 from ucfrec.settings import Share, Weight, settings_table
 
-_FEW: Final = 32
+_FEW = 32
 """Windows up to which calling an operation costs more than its arithmetic."""
 EPSILON: Final = 1e-8
 """Added inside the logarithm of Eq. 5 (Table 7)."""

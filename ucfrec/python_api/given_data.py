@@ -9,7 +9,7 @@ from functools import partial
 from numbers import Real
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 import pyarrow.parquet as pq
@@ -36,9 +36,9 @@ Columns = LogMapping | Mapping[str, str] | str | Path
 """What the columns of logs mean, only the names of some, or a TOML file as of `--mapping`."""
 Resolved = tuple[tuple[Path, ...], LogMapping]
 """Files of logs and what their columns mean."""
-_FRAME: Final = "frame.parquet"
-_KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
-_OPTIONS: Final = (
+_FRAME = "frame.parquet"
+_KEYS = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
+_OPTIONS = (
     (r" or --max-session \d+", ""),
     (r"--column (\w+)=('[^']*'|\.\.\.)", r"mapping=LogMapping({'\1': \2})"),
     (r"--column (\w+)=", r"mapping=LogMapping({'\1': ''})"),
@@ -53,7 +53,7 @@ _OPTIONS: Final = (
     (r"--policy ([\w-]+)", r"policy='\1'"),
 )
 """Options of commands in messages, and what they are in Python."""
-_OUR_MODULES: Final = re.compile(r"(ucfrec|contextlib)(\.|$)")
+_OUR_MODULES = re.compile(r"(ucfrec|contextlib)(\.|$)")
 """Modules whose lines a warning does not name."""
 
 

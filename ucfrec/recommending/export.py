@@ -29,16 +29,16 @@ OUTPUTS: Final = ("scores", "top_items", "top_scores")
 TOLERANCE: Final = 1e-5
 """Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
 """
-_STATE: Final = ("items", "rewards", "steps", "collected", "users", "observations")
+_STATE = ("items", "rewards", "steps", "collected", "users", "observations")
 """Inputs: the first fields of `Sessions`, of which `items` are the actions."""
-_EXCLUDED: Final = "excluded"
-_OPSET: Final = 20
-_DEFAULT_K: Final = 100
-_COMPARED: Final = 16
+_EXCLUDED = "excluded"
+_OPSET = 20
+_DEFAULT_K = 100
+_COMPARED = 16
 """Random sessions on which a graph is compared with torch."""
-_MOST_EXCLUDED: Final = 0.5
+_MOST_EXCLUDED = 0.5
 """Largest share of the items that these exclude, where the graph answers single requests."""
-_MEANINGS: Final = {
+_MEANINGS = {
     "items": "index of each item shown in the session, the latest last; -1 before the session "
     "began",
     "rewards": "reward of each; 0 before the session began",
@@ -55,14 +55,14 @@ _MEANINGS: Final = {
     "top_items": "index of the best items; -1 if fewer are left",
     "top_scores": "their log-probabilities at temperature 1, nats",
 }
-_NOTES: Final = (
+_NOTES = (
     "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
     "and tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
     "draw from `scores` divided by it, with top_k among so many best; with explore, draw that "
     "share of the requests uniformly, with explore_top among so many best"
 )
-_SERVE: Final = "use `ucfrec serve` or `recommend --stream`"
-_TORCH: Final = "use --engine torch"
+_SERVE = "use `ucfrec serve` or `recommend --stream`"
+_TORCH = "use --engine torch"
 
 
 class Exported(NamedTuple):

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import pandas as pd
@@ -25,9 +25,9 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 if TYPE_CHECKING:
     from ucfrec.recommending.responder import Answer
 
-_ROWS: Final = 50_000
-_SECONDS: Final = 60.0
-_MOST_WAITING: Final = 20
+_ROWS = 50_000
+_SECONDS = 60.0
+_MOST_WAITING = 20
 """Files' worth of rows that wait while the disk cannot be written; later ones are lost."""
 
 

@@ -25,23 +25,23 @@ from ucfrec.settings import require_ids, require_whole
 RANK: Final = "rank"
 SCORE: Final = "score"
 SIMILAR_ITEM: Final = "similar_item_id"
-_USERS_AT_ONCE: Final = 128
+_USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
-_SCORES: Final = 2**23
+_SCORES = 2**23
 """Most scores of a forward pass of several users, users × items: 32 MiB, as memory for more is
 given back after every pass, and asking for it anew takes as long as the product."""
-_ITEMS_AT_ONCE: Final = 1024
-_NEGLIGIBLE: Final = 80.0
+_ITEMS_AT_ONCE = 1024
+_NEGLIGIBLE = 80.0
 """Nats below the best score from which on an item counts nothing, in float32."""
-_FEWEST: Final = 1_000
+_FEWEST = 1_000
 """Items below which one list of an index would hold few of them."""
-_SHARE: Final = 16
+_SHARE = 16
 """One in so many lists of an index is searched."""
-_AT_LEAST: Final = 8
+_AT_LEAST = 8
 """Lists that are searched at least."""
-_MORE: Final = 256
+_MORE = 256
 """Candidates that are scored beside four times those requested."""
-_SAMPLE: Final = 32
+_SAMPLE = 32
 """One in so many sessions is also searched exactly."""
 
 

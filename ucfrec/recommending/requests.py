@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, NotRequired
+from typing import Annotated, Any, NamedTuple, NotRequired
 
 import duckdb
 import numpy as np
@@ -42,16 +42,16 @@ _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
 """Of 64 bits: the largest that identifiers have, and small enough to be a float."""
 Id = _Integer | Annotated[str, Field(max_length=1000)]
 Number = Annotated[StrictFloat, Field(allow_inf_nan=False)] | _Integer
-_EARLIEST_MS: Final = 365 * DAY_MS
+_EARLIEST_MS = 365 * DAY_MS
 """Times before 1971 are hardly milliseconds; seconds of today would be there."""
-_LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
-_MOST_FAULTS: Final = 1000
+_LARGEST_FLOAT = float(np.finfo(np.float32).max)
+_MOST_FAULTS = 1000
 """Beyond this number, it would take too long to look at each."""
-_TYPES: Final = ("constrained-str", "float", "constrained-int")
+_TYPES = ("constrained-str", "float", "constrained-int")
 """Last part of pydantic's place of an error in one of several types."""
-_ROWS: Final = "history"
+_ROWS = "history"
 """Name of the rows in messages and in the engine."""
-_MEMORY: Final = "512MB"
+_MEMORY = "512MB"
 """Of which the engine may take half: a request is some megabytes, and no expression makes much more
 of it."""
 
@@ -69,7 +69,7 @@ def _parse_time(value: float | str) -> float:
         ) from None
 
 
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @settings_table("")

@@ -27,11 +27,11 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.schema import SESSION_ID
 
 ONNXRUNTIME: Final = "onnxruntime"
-_LARGEST_EXACT: Final = 2**53 - 1
+_LARGEST_EXACT = 2**53 - 1
 """Largest integer that JavaScript holds exactly."""
 SECONDS: Final = 2.0
 """Time between two looks at which run is current."""
-_UNITS: Final = 2**32
+_UNITS = 2**32
 
 
 class Answer(NamedTuple):

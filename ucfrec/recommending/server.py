@@ -29,16 +29,16 @@ from ucfrec.processes import Interrupted, block_ctrl_c, interruptions_raised
 
 METRICS: Final = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of the folder in which workers share their metrics."""
-_PAUSE: Final = 10.0
+_PAUSE = 10.0
 """Seconds after which a worker that could not start is tried again."""
-_SPAWN: Final = get_context("spawn")
-_SPARE: Final = 192
+_SPAWN = get_context("spawn")
+_SPARE = 192
 """Files that connections leave to the process."""
-_AT_ONCE: Final = 128
+_AT_ONCE = 128
 """Connections that are accepted before any is looked at, for which the spare files suffice."""
-_BACKLOG: Final = 2048
+_BACKLOG = 2048
 """Connections that wait to be accepted."""
-_TOO_MANY: Final = (
+_TOO_MANY = (
     b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nRetry-After: 1\r\n"
     b"Content-Length: 0\r\n\r\n"
 )

@@ -12,8 +12,8 @@ from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
 """Rows that a stream keeps; the least recently active users are dropped first."""
-_BLOCK: Final = 2**16
-_AT_ONCE: Final = 256
+_BLOCK = 2**16
+_AT_ONCE = 256
 """Most requests of a forward pass."""
 
 

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mappin
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from ipaddress import IPv6Address
-from typing import Annotated, Any, Final, NotRequired
+from typing import Annotated, Any, NotRequired
 
 from fastapi import FastAPI, Response
 from fastapi import Request as HTTPRequest
@@ -45,10 +45,10 @@ from ucfrec.recommending.requests import Request, parse
 from ucfrec.recommending.responder import Answer, Mean, Responder, Served
 from ucfrec.settings import settings_table
 
-_HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
-_PATH: Final = "/recommendations"
-_JSON: Final = "application/json"
-_FAULTS: Final = {
+_HOST = re.compile(r"\*|(\*\.)?[\w.-]+")
+_PATH = "/recommendations"
+_JSON = "application/json"
+_FAULTS = {
     400: "Not JSON, no such request, or beyond a limit.",
     408: "The request's body did not arrive in time.",
     413: "The body is too large.",
@@ -57,16 +57,16 @@ _FAULTS: Final = {
     503: "Too many requests wait; try again later.",
     504: "No answer in time.",
 }
-_MOST_HEADERS: Final = 100
-_MOST_HEADER_BYTES: Final = 2**16
+_MOST_HEADERS = 100
+_MOST_HEADER_BYTES = 2**16
 """Of the address, names and values of a request. The server itself stops reading a head that is not
 whole by then."""
-_HUNG_UP: Final = 499
+_HUNG_UP = 499
 """For the metrics, as no client receives it; nginx calls it so."""
-_SECONDS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-_SIZES: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-_DRIFT: Final = "ucfrec_drift"
-_WEIGHT: Final = "ucfrec_drift_weight"
+_SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+_SIZES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+_DRIFT = "ucfrec_drift"
+_WEIGHT = "ucfrec_drift_weight"
 
 
 @settings_table("")

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 360, 220
 """Size of line charts and histograms in SVG units, which are points in matplotlib; charts of
 intervals have the same width. A phone is about as wide, so that text is not scaled there."""
-_VARIABLES: Final = ("ink", "soft", "rule", "paper", *(f"c{series}" for series in range(8)))
+_VARIABLES = ("ink", "soft", "rule", "paper", *(f"c{series}" for series in range(8)))
 # Colors that matplotlib writes into the SVG, where variables take their places.
-_COLORS: Final = {f"#01{number:02x}fe": name for number, name in enumerate(_VARIABLES)}
+_COLORS = {f"#01{number:02x}fe": name for number, name in enumerate(_VARIABLES)}
 INK, SOFT, RULE, PAPER, *SERIES = _COLORS
-_DASHES: Final = ("solid", "dashed", "dotted")
+_DASHES = ("solid", "dashed", "dotted")
 _SHARED_STYLE: Final[Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -61,8 +61,8 @@ _STYLE: Final[Any] = {
 }
 _NAME, _BAR, _BOTTOM = 16, 28, 26
 """Heights of a line of a name, of the bar below it with a gap, and of the axis below all."""
-_NAME_CHARACTERS: Final = 48
-_MOST_LABELS: Final = 6
+_NAME_CHARACTERS = 48
+_MOST_LABELS = 6
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ COLUMN, PAGE = 3.4, 7.0
 """Widths of one column and of the whole page, in inches."""
 PLAIN, OURS = "#8C8C8C", "#D55E00"
 """Colors of other methods, and of UCF."""
-_NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
+_NOT_IN_NAMES = re.compile(r"[^\w,.= -]+")
 
 _FILE_STYLE: Final[Any] = {
     **_SHARED_STYLE,

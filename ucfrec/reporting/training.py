@@ -28,7 +28,7 @@ POINTS: Final = 200
 """Most points of a drawn curve."""
 REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}
 """Key to display name of the reference losses of `ucfrec.runs.record.RunRecord`."""
-_TITLES: Final = {
+_TITLES = {
     "validation_loss": "Validation loss (action, held-out steps)",
     "action_loss": "Training loss of the action (one batch)",
     "attention_on_parents": "Attention mass on the causal parents (1: all of it)",
@@ -40,17 +40,17 @@ _TITLES: Final = {
     "waiting_for_data": "Share of time waiting for data",
 }
 """Logged name to title, in the order of the page; other curves follow."""
-_LOSS_WEIGHTS: Final = {"mask_loss": "lambda_mask", "reward_loss": "reward_weight"}
+_LOSS_WEIGHTS = {"mask_loss": "lambda_mask", "reward_loss": "reward_weight"}
 """Loss to the policy setting that is its weight; with weight 0 it is not trained on."""
-_DISTRIBUTIONS: Final = {
+_DISTRIBUTIONS = {
     "session_lengths": ("Sessions by length", "steps of a session"),
     "rewards": ("Steps by reward", "reward"),
     "item_popularity": ("Items by popularity", "steps that show the item"),
 }
 """Name of a distribution in the `summary` of `prepare` to its title and x-axis label."""
-_MOST_CHARACTERS: Final = 120
+_MOST_CHARACTERS = 120
 """Most characters of the shown features of an item."""
-_LEVELS: Final = ("0", "0.25", "0.5", "0.75", "0.99", "1")
+_LEVELS = ("0", "0.25", "0.5", "0.75", "0.99", "1")
 
 
 def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table | None]:

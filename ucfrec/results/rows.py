@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from annotated_types import Ge, Lt
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
@@ -80,7 +80,7 @@ class RowKey:
         )
 
 
-_KEY_FIELDS: Final = tuple(f.name for f in fields(RowKey) if f.name != "conditions")
+_KEY_FIELDS = tuple(f.name for f in fields(RowKey) if f.name != "conditions")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +149,8 @@ class ResultRow(RowKey):
         return {name: value for name, value in vars(self).items() if value not in (None, "", {})}
 
 
-_NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
-_ROWS: Final = TypeAdapter(ResultRow)
+_NESTED = ("conditions", "metrics", "interval", "details", "versions")
+_ROWS = TypeAdapter(ResultRow)
 
 
 def row_from_json(text: str, where: str) -> ResultRow:
@@ -258,8 +258,8 @@ def _write(path: Path, text: str, rows: Sequence[ResultRow]) -> None:
         scratch.write_bytes((text + lines).encode())
 
 
-_ORIGIN: Final = ("config_hash", "data_fingerprint")
-_IDENTITY: Final = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint")
+_ORIGIN = ("config_hash", "data_fingerprint")
+_IDENTITY = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint")
 """Fields that a frame leaves out; a file of the rows has them."""
 
 

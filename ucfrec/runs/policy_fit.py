@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 
-_VALIDATION_BATCHES: Final = 16
-_VALIDATION_BATCH: Final = 256
+_VALIDATION_BATCHES = 16
+_VALIDATION_BATCH = 256
 
 
 def fit_policy(

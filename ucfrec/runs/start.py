@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,13 +31,13 @@ from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, read_record, ref
 from ucfrec.runs.trained_policy import COUNTS, ITEMS, RETURNS, RULE, USERS, TrainedPolicy
 from ucfrec.user_model.reward_fit import reward_model_sizes
 
-_SHARE: Final = 1 / 16
+_SHARE = 1 / 16
 """Steps of a warm training, as a share of those of one from scratch."""
-_MOST_RETURNS: Final = 1_000_001
-_QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
-_SCALES: Final = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
+_MOST_RETURNS = 1_000_001
+_QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
+_SCALES = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
 """Buffers of a policy that its weights were trained with."""
-_CRM_EPOCHS: Final = 5
+_CRM_EPOCHS = 5
 """Epochs that `crm.epochs` 0 stands for."""
 
 

@@ -43,15 +43,15 @@ METRICS: Final = {
     "gauc": "probability that a liked item scores above another one shown to the user, on "
     "validation rows",
 }
-_MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
-_NO_VALUE: Final = (
+_MEASURES = {"ndcg": "ndcg_liked", "gauc": "gauc"}
+_NO_VALUE = (
     "has no estimated value, because its decision rule is not selected in simulated sessions; use "
     "--metric ndcg or gauc"
 )
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
-_REMEDY: Final = "restore it, or name another folder"
-_COMPARED: Final = 4
+_REMEDY = "restore it, or name another folder"
+_COMPARED = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
 

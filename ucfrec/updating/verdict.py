@@ -26,10 +26,10 @@ from ucfrec.user_model.reward_report import (
 
 RANKING: Final = "ndcg_liked"
 VALUE: Final = "reward per step"
-_K: Final = 10
-_LEAST_STEPS: Final = 30
+_K = 10
+_LEAST_STEPS = 30
 """Effective steps below which weights say nothing."""
-_SEEN_REMOVED: Final = "as where it was served without seen items: update with --filter-seen"
+_SEEN_REMOVED = "as where it was served without seen items: update with --filter-seen"
 
 
 def compare_runs(
@@ -146,10 +146,10 @@ def _doubt(weights: Float64Array, user: IntArray, filter_seen: bool) -> str:
     return f"the weights leave {effective:.0f} effective steps" if effective < _LEAST_STEPS else ""
 
 
-_GROUPS: Final = 10
-_PRIOR: Final = 0.5
+_GROUPS = 10
+_PRIOR = 0.5
 """Added to every count, so that no group is empty."""
-_MOST_STEPS: Final = 100_000
+_MOST_STEPS = 100_000
 LARGE: Final = 0.25
 """Population stability index from which on a distribution counts as another one; below 0.1 it
 counts as the same (Siddiqi, Credit Risk Scorecards, 2006)."""

@@ -16,9 +16,9 @@ from ucfrec.episodes.windows import Shown
 
 LONGEST: Final = 8
 """Largest length of a run, and largest number of steps that it lasts, that are tried."""
-_MOST: Final = 0.5
+_MOST = 0.5
 """Largest factor that counts as fatigue."""
-_EXPECTED: Final = 20.0
+_EXPECTED = 20.0
 """Fewest rewards to be expected of users without fatigue, from which a factor is estimated."""
 
 

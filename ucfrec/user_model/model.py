@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,13 +31,13 @@ from ucfrec.user_model.session_end import (
     whole_sessions,
 )
 
-_MOST_STEPS: Final = 100_000
+_MOST_STEPS = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
-_GROUPS: Final = 32
+_GROUPS = 32
 """Most rewards to draw from."""
-_BEYOND: Final = 3, 100
+_BEYOND = 3, 100
 """Simulated sessions may have so many times the longest logged one's steps, up to so many, …"""
-_CHANCE: Final = 0.001
+_CHANCE = 0.001
 """… unless chance ends all sessions that get there with a lower probability than this."""
 
 

@@ -12,13 +12,13 @@ from ucfrec.episodes.windows import Shown
 
 MEMORY: Final = 50
 """Steps of a session that show tastes, the latest ones."""
-_LEAST: Final = 1e-6
+_LEAST = 1e-6
 """Variance of tastes in every direction, relative to the mean."""
 FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
 LAGS: Final = 10
 """Items shown before a step whose repetition and likeness enter its expected reward."""
-_AT_ONCE: Final = 8192
+_AT_ONCE = 8192
 """Items that are compared to what was shown before them at once."""
 CLIP: Final = 5.0
 """Standardised states beyond this many standard deviations are clipped."""

@@ -23,32 +23,32 @@ EFFECTS: Final = (
     *("context", "state", "interaction"),
 )
 """In the order in which they are added to the model."""
-_ITERATIONS: Final = 100
-_HISTORY: Final = 10
+_ITERATIONS = 100
+_HISTORY = 10
 """Steps that L-BFGS remembers, …"""
-_REMEMBERED: Final = 3 * 2**23
+_REMEMBERED = 3 * 2**23
 """… in at most so many numbers, or 2 steps; twice, for the changes of the gradient."""
-_TOLERANCE: Final = 1e-6
+_TOLERANCE = 1e-6
 """Relative decrease of the objective in an iteration at which a fit ends."""
 _ARMIJO, _SHORTEST = 1e-4, 1e-4
 """Least decrease of a step relative to the slope, and shortest step that is tried."""
-_SMALLEST: Final = 1e-6
-_SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
-_FIRST: Final = 6
+_SMALLEST = 1e-6
+_SPREADS = tuple(0.05 * 2 ** (k / 2) for k in range(13))
+_FIRST = 6
 """Index of the spread that is tried first, 0.4."""
 CHEAP: Final = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
-_STRIDES: Final = {**dict.fromkeys(CHEAP, (2, 1)), "tastes": ()}
+_STRIDES = {**dict.fromkeys(CHEAP, (2, 1)), "tastes": ()}
 """Steps of the search of a spread, (2,) for others; one number alone needs no search."""
-_LEAST_KNOWN: Final = 0.1
+_LEAST_KNOWN = 0.1
 """Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
-_SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
+_SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
 LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
-_ITEMS: Final = ("item", "content")
+_ITEMS = ("item", "content")
 """Effects of items alone."""
-_ROWS: Final = 512
+_ROWS = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
 
 Effects = dict[str, Tensor]

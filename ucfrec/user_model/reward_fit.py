@@ -9,7 +9,7 @@ shows make what they showed look better; known users are calibrated on weighted 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pydantic
@@ -42,13 +42,13 @@ from ucfrec.user_model.reward_report import (
 )
 
 _Report = TypeVar("_Report")
-_USERS_FITTED: Final = "training_users.safetensors"
+_USERS_FITTED = "training_users.safetensors"
 """File of the reward model of training users in its folder."""
-_MAX_ROWS: Final = 500_000
-_MAX_STEPS: Final = 100_000
-_WARM_ROWS: Final = 25_000
+_MAX_ROWS = 500_000
+_MAX_STEPS = 100_000
+_WARM_ROWS = 25_000
 """Most rows of a search that begins near an earlier one."""
-_CONSTANT: Final = 1e-6
+_CONSTANT = 1e-6
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)

@@ -17,12 +17,12 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.results.statistics import ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
-_BINS: Final = 10
-_CHUNK: Final = 16_384
-_READ_AT_ONCE: Final = 16_384
-_LARGEST_WEIGHT: Final = 10.0
+_BINS = 10
+_CHUNK = 16_384
+_READ_AT_ONCE = 16_384
+_LARGEST_WEIGHT = 10.0
 """Larger weights are cut off, so that no single row decides."""
-_FEWEST: Final = 50
+_FEWEST = 50
 """Rows of a half from which on a line is fitted to it."""
 SAVED: Final = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""

@@ -23,28 +23,28 @@ from ucfrec.user_model.reward_report import draw_numbers, mean_gain
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
-_PENALTY: Final = 1.0
+_PENALTY = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
-_LAGS: Final = 10
+_LAGS = 10
 """Items shown before that count, as many as a tag window may keep from being repeated."""
-_INPUTS: Final = 4 + _LAGS + 4 + 3
+_INPUTS = 4 + _LAGS + 4 + 3
 """Number of inputs; see `_columns`."""
-_STEPS: Final = [0, 1]
+_STEPS = [0, 1]
 """Numbers of the inputs that grow with the number of the step."""
-_REWARD: Final = 3
+_REWARD = 3
 """Number of the input that is the step's reward."""
-_FEWEST: Final = 20
+_FEWEST = 20
 """Fewest steps that end a session, and that do not, that tell more than their share."""
-_STEP: Final = 2.0**-10
+_STEP = 2.0**-10
 """Likeness is rounded to multiples of this, so that torch and onnxruntime agree on thresholds."""
-_HIGHEST: Final = 20.0
+_HIGHEST = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
 TREES: Final = 100
 LEAVES: Final = 8
 """Most trees, and leaves of a tree."""
-_SETTINGS: Final = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
-_SPLITS: Final = LEAVES - 1
-_LOGISTIC: Final = ("highest", "mean", "scale", "weights", "bias")
+_SETTINGS = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
+_SPLITS = LEAVES - 1
+_LOGISTIC = ("highest", "mean", "scale", "weights", "bias")
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,11 @@ policy = ControlPolicy.load("run")  # target=… asks for another return
 env = gymnasium.make("Pendulum-v1")
 observation, _ = env.reset(seed=0)
 policy.reset()
-reward, total, ended = None, 0.0, False
+reward: float | None = None
+total, ended = 0.0, False
 while not ended:
     action = policy.act(observation, reward)
-    observation, reward, terminated, truncated, _ = env.step(action)
-    total, ended = total + float(reward), terminated or truncated
+    observation, earned, terminated, truncated, _ = env.step(action)
+    reward, ended = float(earned), terminated or truncated
+    total += reward
 print(f"return {total:.1f}")

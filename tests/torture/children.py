@@ -40,7 +40,8 @@ class End:
             return "traceback: " + printed.splitlines()[-1][:150]
         if self.status not in allowed:
             return f"status {self.status}: {printed[-150:]}"
-        quiet = ("benchmark", "ucfrec: note")  # notes and lines of counting
+        # Notes, lines of counting, and what a server says while it goes on.
+        quiet = ("benchmark", "ucfrec: note", "ucfrec: exposures", "ucfrec serve: stopped")
         lines = sum(not line.startswith(quiet) for line in printed.splitlines())
         if self.status in (2, 130, 143) and lines != 1:
             return f"{lines} lines: {printed[:150]}"

@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -87,11 +87,13 @@ class ExposureLog:
         trained: TrainedPolicy,
         rows: int = _ROWS,
         seconds: float = _SECONDS,
+        clock: Callable[[], float] = time.time,
     ) -> None:
         """
         Args:
             rows: from so many on a file is written.
             seconds: after so long, a file is written if there are any rows.
+            clock: seconds since 1970, when an answer is given.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -100,7 +102,7 @@ class ExposureLog:
             what = explain_os_error(error)
             raise InputError(f"{folder} cannot be written ({what}); name another folder") from None
         self._folder, self._schema = folder, exposure_schema(trained)
-        self._rows, self._seconds = rows, seconds
+        self._rows, self._seconds, self._clock = rows, seconds, clock
         self._waiting: list[tuple[str, int, Answer]] = []
         self._count, self._lost = 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
@@ -109,7 +111,7 @@ class ExposureLog:
 
     def add(self, user_id: int | str, answer: "Answer") -> None:
         """Remember an answer that is given now; takes microseconds."""
-        now, size = int(time.time() * 1000), len(answer.items)
+        now, size = int(self._clock() * 1000), len(answer.items)
         with self._lock:
             if self._count > _MOST_WAITING * self._rows:
                 self._lost += size

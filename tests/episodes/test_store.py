@@ -259,9 +259,7 @@ def test_a_user_of_4000_rows_in_a_session_changes_nothing_that_is_learned(tmp_pa
     assert kept.n_steps == store.n_steps - 4000
     ends = [each["rule"]["session_end"] for each in (people, bot)]
     assert ends[0]["kept"] == ends[1]["kept"]
-    assert ends[1]["rows"] < ends[0]["rows"]
     assert ends[1]["loss"]["constant"] == pytest.approx(ends[0]["loss"]["constant"], rel=0.1)
-    assert bot["reward_model"]["train_rows"] < people["reward_model"]["train_rows"]
     rules = [each["rule"]["rule"] for each in (people, bot)]
     for name in rules[0].keys() - {"target"}:
         assert rules[0][name] == rules[1][name], name

@@ -22,7 +22,7 @@ from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.processes import progress
-from ucfrec.results.statistics import effective_number, ratio_with_error
+from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import (
     draw_episodes,
     draw_steps,
@@ -136,7 +136,8 @@ class LoggedEvidence:
         halves = [half for half in (below[::2], below[1::2]) if len(half)]
         effective_users = 2 * min(effective_number(half) for half in halves)
         spread = float(sums[np.isfinite(sums)].var())
-        value, error = ratio_with_error(above, below)
+        value = above.sum() / below.sum()
+        error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
         return Evidence(rate, likelihood, effective_users, spread, value, error)
 
 

@@ -9,7 +9,7 @@ also leave enough effective users to evaluate it off-policy.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import groupby, product
 from operator import attrgetter
 from statistics import median_high
 from typing import Any, NamedTuple
@@ -90,6 +90,7 @@ class _ManyRules(PolicyActor):
         users = np.arange(len(states.user_features))
         super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
         self._scorers = scorers
+        self._targets = [(each.rule.target, each.rule.minimum_target) for each in scorers]
         self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
         self._rule = np.repeat(np.arange(len(scorers)), n)
 
@@ -106,8 +107,12 @@ class _ManyRules(PolicyActor):
         decisions = []
         most = max(1, _SCORES_AT_ONCE // self._n_items)
         for batch in _batch_rules(self._rule[rows.numpy()], most):
-            begin = batch[0][1].start
-            windows = [self._scorers[number].windows(sessions.at(part)) for number, part in batch]
+            begin, windows = batch[0][1].start, list[Windows]()
+            # Windows depend on the rule's targets alone.
+            for _, rules in groupby(batch, lambda entry: self._targets[entry[0]]):
+                (number, part), *others = rules
+                end = others[-1][1].stop if others else part.stop
+                windows.append(self._scorers[number].windows(sessions.at(slice(part.start, end))))
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)

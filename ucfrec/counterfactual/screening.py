@@ -153,7 +153,17 @@ def find_measurements(
             bar.update()
     # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return {
-        d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, seed)) for d in tested
+        d: d in leaks
+        and (
+            len(leaks) == 1
+            or _measures(
+                data,
+                d,
+                leaks - {d},
+                seed,
+            )
+        )
+        for d in tested
     }
 
 

@@ -64,7 +64,8 @@ def fit_policy(
 
     def mean_loss() -> float:
         """Mean action loss at a fixed sample of validation steps."""
-        losses = [policy.action_loss(batch.to(device)) for batch in windows]
+        on_device = windows if device.type == "cpu" else [batch.to(device) for batch in windows]
+        losses = [policy.action_loss(batch) for batch in on_device]
         mean = float(torch.stack(losses).mean()) if losses else 0.0
         return mean if alone else distributed.joint_means({"loss": mean}, len(losses))["loss"]
 
@@ -82,7 +83,8 @@ def fit_policy(
         if len(newest):
             of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
             episodes[::2] = newest[of_recent]
-        return training.windows(episodes[rows], steps[rows], k).to(device)
+        windows = training.windows(episodes[rows], steps[rows], k)
+        return windows if device.type == "cpu" else windows.to(device)
 
     def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         lower = config.train.precision == "bfloat16"

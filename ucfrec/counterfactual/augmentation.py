@@ -483,21 +483,7 @@ class ActionGenerator:
             factual = read_transitions(view, at[0], at[1], self.item_rewards).to(self.crm.device)
             s, a, r = (v.double() for v in (factual.states, factual.actions, factual.rewards))
             z = exact.abduct(s, a, r)
-            reproduced = (
-                (
-                    (
-                        exact.predict(
-                            s,
-                            a,
-                            z,
-                        )
-                        - r
-                    ).abs()
-                    <= self.epsilon_r
-                )
-                .cpu()
-                .numpy()
-            )
+            reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
             labels = self.clusters.nearest(self.crm.normalise_states(factual.states).cpu()).numpy()
             rows = np.repeat(np.arange(len(drawn_at)), count)
             actions, drawable = self.support.draw(labels[rows], rng)

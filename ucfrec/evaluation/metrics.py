@@ -39,18 +39,9 @@ def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> 
 
 def precision(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
     """Share of `k` places that hold a relevant item, mean over users."""
-    return float(
-        (
-            _hits(
-                recommended,
-                relevant,
-                k,
-            )
-            .groupby(USER_ID)[_RANK]
-            .count()
-            / k
-        ).mean()
-    )
+    hits = _hits(recommended, relevant, k)
+    per_user = hits.groupby(USER_ID)[_RANK].count()
+    return float((per_user / k).mean())
 
 
 def recall(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:

@@ -105,7 +105,7 @@ _READERS: dict[str, Mutant] = {
     "hopper.hdf5 alone": ("_control.data.d4rl.open_hdf5", h5py.File),
 }
 MUTANTS: dict[tuple[str, str], Mutant] = {
-    **{("kills", job): (".files.atomic._scratch_moved", _write_in_place) for job in _JOBS},
+    **{("kills", job): (".files.atomic._scratch", _write_in_place) for job in _JOBS},
     ("interruptions", "collect"): (".files.atomic._remove", lambda _: None),
     ("pairs", "prepare"): (".files.atomic.claim", _claim_nothing),
     ("flips", "store"): _UNCHECKED,

@@ -119,7 +119,7 @@ def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
         f"- {environment}: logged sessions have {values['logging']}, random actions "
         f"{values['random']}, the best\n  possible ones {values['optimal']}. From the log alone, "
         f"UCF reaches {values['ucf']}, DT {values['dt']};\n  {shared}.\n"
-        "  Where two intervals overlap, the order is open."
+        "  Where two intervals overlap, the order is unclear."
     )
 
 

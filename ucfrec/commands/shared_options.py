@@ -141,7 +141,7 @@ class RuleOptions(Table):
     shows_defaults = False
 
     checkpoint: Literal["best", "last"] = "best"
-    """Policy weights; of the lowest validation loss, or the last ones, of runs without a refit"""
+    """Weights of the lowest validation loss or the last ones, for runs without a refit"""
     target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
     """Target return, in units of the reward, of a session; of every step with a horizon or
     discount"""

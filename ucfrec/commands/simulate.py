@@ -54,8 +54,8 @@ class Evaluate(SimulationOptions, RuleOptions):
         print(evaluation_table(list(evaluation)))
         print(
             "\nR_cum: mean return of a session, the sum of its rewards, with a 95% interval; where "
-            "two overlap, the order is unclear.\nR_avg: reward per step, over all steps (pooled) or "
-            "in the mean of sessions (episode)."
+            "two overlap, the order is unclear.\nR_avg: reward per step, over all steps (pooled) "
+            "or in the mean of sessions (episode)."
         )
         if self.json is not None:
             evaluation.save(self.json)

@@ -17,6 +17,9 @@ ACTION: Final = "action"
 OBSERVATION: Final = "observation"
 """A list of floats: what was observed just before the action."""
 
+CANDIDATES: Final = "candidates"
+"""A list of item ids: what the item was chosen from. In a store, the number of that set."""
+
 # Columns of exposures, one row per item shown, besides those of logs.
 REQUEST_ID: Final = "request_id"
 POSITION: Final = "position"
@@ -47,6 +50,7 @@ STEP_DTYPES: Final = {
     TIMESTAMP: "<i8",
     PROPENSITY: "<f4",
     IS_RANDOM: "|u1",
+    CANDIDATES: "<i4",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 
@@ -63,3 +67,5 @@ USER_IDS: Final = "user_id"
 """Key of `info`: (N,) int64, user of each environment's next step, numbered as in the logs."""
 FORBIDDEN: Final = "forbidden"
 """Key of `info`: (N, L) int64, items not allowed at the next step; rows are padded with −1."""
+OFFER: Final = "offer"
+"""Key of `info`: `Offer` of the N environments' next step."""

@@ -277,6 +277,8 @@ class Scorer:
                     without[left_out] = True
                 if excluded is not None:
                     without |= excluded
+                if sessions.offer is not None:
+                    without |= ~sessions.offer.mask()
                 return _require_scores(self._engine(sessions, without), empty)
             return self.scores_of(self.query(sessions), left_out, excluded, empty=empty)
 
@@ -303,6 +305,8 @@ class Scorer:
             scores[left_out] = -torch.inf
         if excluded is not None:
             scores = scores.masked_fill_(excluded, -torch.inf)
+        if query.sessions.offer is not None:
+            scores = scores.masked_fill_(~query.sessions.offer.mask(), -torch.inf)
         for without in self._items.without_tags(self.rule, query.sessions.shown):
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
@@ -331,6 +335,9 @@ class Scorer:
         """
         rewards = bool(self.rule.reward_weight)
         scores = products + self._items.addends(query.items, part, candidates, rewards)
+        if query.sessions.offer is not None:
+            offered = query.sessions.offer.mask().gather(1, candidates)
+            scores = scores.masked_fill(~offered, -torch.inf)
         for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
             scores = scores.masked_fill(without, -torch.inf)
         return scores

@@ -213,7 +213,7 @@ class RuleSearch:
         decisions = list[IntArray]()
         with progress(len(live), "choose the rule", "sessions") as bar:
             while len(live):
-                actor.inform({schema.USER_IDS: simulator.users})
+                actor.inform({schema.USER_IDS: simulator.users, schema.OFFER: simulator.offer})
                 items, _ = actor.act(simulator.observations(), np.ones(len(live), dtype=bool))
                 rewards, going = simulator.step(items)
                 actor.observe(items, rewards)

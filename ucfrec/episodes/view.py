@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +13,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
+from ucfrec.episodes.offers import Offer, Offers
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
@@ -26,6 +28,8 @@ _DTYPES: Final = {
     **schema.EPISODE_DTYPES,
 }
 _BATCH_STEPS = 2**20
+_OFFERED = 2**28
+"""Most pairs of a step and an item that `even_counts` looks at."""
 _LONG_ENOUGH = 1000
 """Mean number of steps from which consecutive steps are read as slices."""
 
@@ -128,6 +132,14 @@ class Columns:
             return self._given_states
         self.record.require(self.path, ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
+
+    @cached_property
+    def offers(self) -> Offers | None:
+        """When items are available, and sets of candidates; None where all is always on offer."""
+        if not (self.path / OFFERS).is_file():
+            return None
+        self.record.require(self.path, OFFERS)
+        return Offers.load(self.path / OFFERS, len(self.item_states.embeddings))
 
     @property
     def has_item_states(self) -> bool:
@@ -345,6 +357,15 @@ class EpisodeView:
         index = self._columns.starts[self.episode_ids[episodes]] + steps
         return self._columns.step_column(name).take(index)
 
+    def offer(self, episodes: IntArray, steps: IntArray) -> Offer | None:
+        """What was on offer at steps of episodes, as `step_values`; None for everything."""
+        offers = self._columns.offers
+        if offers is None:
+            return None
+        names = [n for n in (schema.TIMESTAMP, schema.CANDIDATES) if n in self.record.columns]
+        values = [self.step_values(name, episodes, steps).astype(np.int64) for name in names]
+        return Offer(offers, *(torch.from_numpy(value) for value in values))
+
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""
         owner, earlier_steps = list_earlier(steps)
@@ -402,6 +423,20 @@ class EpisodeView:
             counts += np.bincount(items, minlength=len(counts))
         return counts
 
+    def even_counts(self) -> Tensor | None:
+        """(n_items,) float32 expected `item_counts` of even draws from what was on offer, from some
+        of the steps if they are many; None without offers."""
+        n_items = len(self.item_states.embeddings) if self.has_items else 1
+        stride = -(-self.n_steps * n_items // _OFFERED)
+        numbers, counts = np.arange(0, self.n_steps, stride), torch.zeros(n_items)
+        for part in np.array_split(numbers, -(-len(numbers) * n_items // _BATCH_STEPS) or 1):
+            offer = self.offer(*self.locate(part))
+            if offer is None:
+                return None
+            offered = offer.mask().float()
+            counts += (offered / offered.sum(1, keepdim=True).clamp(min=1)).sum(0)
+        return counts * (self.n_steps / max(1, len(numbers)))
+
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
         return self.locate(generator.integers(self.n_steps, size=count))
@@ -441,7 +476,8 @@ class EpisodeView:
         if self.has_items:
             actions = actions.long()
         states = columns.states(numbers, steps)
-        return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
+        windows = Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
+        return replace(windows, offer=self.offer(episodes[:, None], steps.clip(min=0)))
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
         """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
@@ -23,13 +24,17 @@ AUGMENTED: Final = "augmented.safetensors"
 """Name of the file of a run."""
 
 
-_Rows = TypeVar("_Rows", "Windows", "Transitions", "Sessions")
+_Rows = TypeVar("_Rows", "Windows", "Transitions", "Exposed", "Sessions")
 
 
 def _each(rows: _Rows, change: Callable[[Tensor], Tensor]) -> _Rows:
     """A copy in which every tensor is changed."""
     values = {field.name: getattr(rows, field.name) for field in fields(rows)}
-    changed = {name: change(value) for name, value in values.items() if value is not None}
+    changed: dict[str, Any] = {
+        name: value.change(change) if isinstance(value, Offer) else change(value)
+        for name, value in values.items()
+        if value is not None
+    }
     return replace(rows, **changed)
 
 
@@ -49,6 +54,8 @@ class Windows:
     """(B, K) int64 number of the step in its episode, from 0."""
     mask: Tensor
     """(B, K) bool, true at steps of the episode, false at padding."""
+    offer: Offer | None = None
+    """What was on offer at each of the (B, K) steps; None for everything."""
 
     def __repr__(self) -> str:
         (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
@@ -84,8 +91,12 @@ class Windows:
     @classmethod
     def joined(cls, parts: Sequence["Windows"]) -> "Windows":
         """The windows of all parts, one part after the other."""
-        names = [f.name for f in fields(cls)]
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        columns: dict[str, Any] = {
+            name: torch.cat([getattr(part, name) for part in parts])
+            for name, value in vars(parts[0]).items()
+            if isinstance(value, Tensor)
+        }
+        return cls(**columns)
 
     def at(self, rows: slice | Tensor) -> "Windows":
         """The windows with the given numbers."""
@@ -164,7 +175,8 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposed:
-    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
+    """The items shown before each of M steps with their rewards, the step's return-to-go, and what
+    was on offer."""
 
     items: Tensor
     """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
@@ -172,17 +184,21 @@ class Exposed:
     """(M, N) their rewards, in reward units."""
     returns: Tensor
     """(M,) returns-to-go in units of the policy's return scale."""
+    offer: Offer | None = None
+    """Of the M steps; None for everything."""
 
     @classmethod
     def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
         """For every step t of B windows of K steps, or those in a mask (B, K): steps t − 1 to
         t − `lags` of the same window."""
         items = windows.actions.masked_fill(~windows.mask, -1)
-        parts = [_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0)]
-        parts.append(windows.returns_to_go.flatten())
-        if steps is not None:
-            parts = [part[steps.flatten()] for part in parts]
-        return cls(*parts)
+        exposed = cls(
+            _earlier(items, lags, -1),
+            _earlier(windows.rewards, lags, 0),
+            windows.returns_to_go.flatten(),
+            windows.offer and windows.offer.change(torch.flatten),
+        )
+        return exposed if steps is None else _each(exposed, lambda part: part[steps.flatten()])
 
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
@@ -193,6 +209,7 @@ class Exposed:
             nn.functional.pad(recent.items, (0, missing), value=-1),
             nn.functional.pad(recent.rewards, (0, missing)),
             windows.returns_to_go[:, -1],
+            windows.offer and windows.offer.change(lambda part: part[:, -1]),
         )
 
 
@@ -222,6 +239,8 @@ class Sessions:
     any."""
     states: Tensor | None = None
     """(B, K, S) float32 of the last K steps or more, where they are known; None to build them."""
+    offer: Offer | None = None
+    """What is on offer at the step to decide; None for everything."""
 
     @classmethod
     def begun(cls, count: int, length: int, vector_size: int = 0) -> "Sessions":
@@ -284,6 +303,7 @@ class Sessions:
             torch.from_numpy(store.rewards_before(episodes, steps)),
             torch.from_numpy(users),
             states=store.windows(episodes, steps, context).states,
+            offer=store.offer(episodes, steps),
         )
 
     def at(self, rows: slice | IntArray | Tensor) -> "Sessions":

@@ -11,7 +11,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
@@ -28,6 +28,7 @@ from ucfrec.logs.tables import (
     quote_name,
     raw_name,
 )
+from ucfrec.logs.typed import cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -38,6 +39,7 @@ CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 _WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
 """DuckDB type of reals to the bound below which it holds every whole number."""
+_TIMES: Final = ("available_from", "available_until")
 _MANY_LACKING: Final = 0.2
 """Share of the ids without a row above which a note says so."""
 
@@ -51,6 +53,8 @@ class _Part:
     first_by: str
     features: dict[str, tuple[str, str]]
     """Feature, without regard to case, to its (SQL, type)."""
+    available: tuple[str, ...]
+    """SQL of the ms from and until which items are available; empty if that is not said."""
 
 
 def load_features(
@@ -70,11 +74,16 @@ def load_features(
         opened = open_tables(connection, log_files(table.files))
         parts = [_read_part(connection, part, table, kind) for part in opened]
         types = _find_common_types(parts, kind)
-        rows_of_parts = " UNION ALL ".join(_select_rows(part, types, id_type) for part in parts)
+        has_times = any(part.available for part in parts)
+        rows_of_parts = " UNION ALL ".join(
+            _select_rows(part, types, id_type, has_times) for part in parts
+        )
         with explain_errors(connection, opened, opened[0].files[0].parent):
             connection.execute(
                 f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
             )
+            if has_times:
+                _split_times(connection, name, table)
         counts = f"SELECT count(*), count(DISTINCT id) FROM {name}"
         ((rows, ids),) = connection.sql(counts).fetchall()
         if rows != ids:
@@ -85,11 +94,45 @@ def load_features(
     return names
 
 
+def _split_times(connection: duckdb.DuckDBPyConnection, name: str, table: FeatureTable) -> None:
+    """Move `begin` and `until` of a feature table to a table of their own, several rows an id."""
+    connection.execute(f"CREATE TABLE {name}_times AS SELECT DISTINCT id, begin, until FROM {name}")
+    empty = _count(connection, f"{name}_times WHERE begin >= until")
+    if empty:
+        raise InputError(
+            f"{', '.join(map(str, table.files))}: {empty:,} of {_count(connection, name):,} rows "
+            "are available until a time that is not after that from which they are; correct them"
+        )
+    connection.execute(
+        f"CREATE OR REPLACE TABLE {name} AS SELECT DISTINCT * EXCLUDE (begin, until) FROM {name}"
+    )
+
+
+def read_intervals(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> IntArray | None:
+    """(3, I) number of an item and the ms from and until which it is available, of feature tables;
+    None if none of them says."""
+    created = {row[0] for row in connection.sql("SHOW TABLES").fetchall()}
+    tables = [f"{name}_times" for name in names if f"{name}_times" in created]
+    if not tables:
+        return None
+    low, high = ALWAYS
+    rows = connection.sql(
+        " UNION ALL ".join(
+            f"SELECT number::BIGINT AS number, coalesce(begin, {low}) AS begin, "
+            f"coalesce(until, {high}) AS until FROM items JOIN {name} ON {schema.ITEM_ID} = id"
+            for name in tables
+        )
+    ).fetchnumpy()
+    return np.stack([rows[name].astype(np.int64) for name in ("number", "begin", "until")])
+
+
 def _read_part(
     connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
 ) -> _Part:
     key = bind(connection, opened, f"key of {kind} features", table.key)
     key_columns = {name.casefold() for name in key.columns}
+    times = _bind_times(connection, opened, table, kind)
+    key_columns |= {name.casefold() for time in times.values() for name in time.columns}
     names = table.columns or tuple(
         name
         for name in opened.columns
@@ -112,8 +155,33 @@ def _read_part(
         order = bind(connection, opened, f"first_by of {kind} features", table.first_by)
         sources.append(order)
         first_by = order.sql
+    sources += times.values()
     columns = (column for source in sources for column in source.columns)
-    return _Part(opened.of(columns, raw), key, first_by, features)
+    narrow = opened.of(columns, raw)
+    available = tuple(
+        _cast_time(connection, narrow, name, times[name]) if name in times else "NULL::BIGINT"
+        for name in (_TIMES if times else ())
+    )
+    return _Part(narrow, key, first_by, features, available)
+
+
+def _cast_time(connection: duckdb.DuckDBPyConnection, table: Table, name: str, time: Bound) -> str:
+    return cast_value(connection, table, schema.TIMESTAMP, name, time, None)[0]
+
+
+def _bind_times(
+    connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
+) -> dict[str, Bound]:
+    """`available_from` and `available_until` of items, as far as a table has them."""
+    if kind != schema.ITEM_ID:
+        return {}
+    columns = {name.casefold() for name in opened.columns}
+    texts = {name: getattr(table, name) or (name if name in columns else "") for name in _TIMES}
+    return {
+        name: bind(connection, opened, f"for {name} of items", text)
+        for name, text in texts.items()
+        if text
+    }
 
 
 def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
@@ -151,7 +219,7 @@ def _find_common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
     return {name: "VARCHAR" if type_ == NOTHING else type_ for name, type_ in types.items()}
 
 
-def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
+def _select_rows(part: _Part, types: dict[str, str], id_type: str, has_times: bool) -> str:
     """SQL of the rows of a part: `id`, `f0`, …."""
     id_sql, first = _cast_id(part.key.sql, part.key.kind, id_type), ""
     columns = [
@@ -163,6 +231,9 @@ def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
         order = ", ".join([part.first_by, *columns])
         first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
     values = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
+    if has_times:
+        begin, until = part.available or ("NULL::BIGINT", "NULL::BIGINT")
+        values += f", {begin} AS begin, {until} AS until"
     return f"SELECT {id_sql} AS id{values} FROM {part.table.sql}{first}"
 
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
-from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
@@ -27,6 +27,7 @@ from ucfrec.logs.features import (
     feature_digest,
     load_features,
     note_unread_features,
+    read_intervals,
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
@@ -158,12 +159,19 @@ def prepare(
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]
             record = writer.finish(report["reward"], report, ids)
             if like is not None and typed.key == schema.ITEM_ID:
-                shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+                for name in (ITEM_STATES, OFFERS):
+                    if (like / name).is_file():
+                        shutil.copy(like / name, folder / name)
             elif typed.key == schema.ITEM_ID:
                 from ucfrec.logs.items import write_item_states  # imports scipy
 
                 encoded = encode_ids(typed.connection, log.features)
                 write_item_states(folder, log.scratch, encoded, options.embedding_size)
+                intervals = read_intervals(typed.connection, log.features[schema.ITEM_ID])
+                if intervals is not None:
+                    from ucfrec.episodes.offers import Offers  # imports torch
+
+                    Offers.of(len(encoded.item_counts), intervals).save(folder / OFFERS)
             if like is not None:
                 sessions.write_episode_users(typed, folder / sessions.EPISODE_USERS)
             record.seal(folder)

@@ -141,7 +141,8 @@ class _Network(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
         *session, excluded = inputs
-        return self.scorer.scores(Sessions(*session), excluded=excluded, empty=True)
+        sessions = Sessions(*session)  # type: ignore[arg-type]
+        return self.scorer.scores(sessions, excluded=excluded, empty=True)
 
 
 class RuleGraph(_Network):

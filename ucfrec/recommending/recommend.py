@@ -1,5 +1,6 @@
 """Recommend next items to users of logs, also to new ones; similar items; an approximate search."""
 
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -132,6 +133,11 @@ class Chooser:
     scorer: Scorer
     seed: int
     index: "ItemIndex | None" = None
+    at_ms: int | None = None
+    """Time at which items must be available, ms; None for that of each call."""
+
+    def _request_ms(self) -> int:
+        return round(time.time() * 1000) if self.at_ms is None else self.at_ms
 
     def choose(
         self,
@@ -185,6 +191,9 @@ class Chooser:
         """`choose` with one forward pass, of latest sessions."""
         rule = self.scorer.rule
         sessions = sessions_of(self.trained, latest, self.scorer.length)
+        if self.trained.offers is not None:
+            times = torch.full((len(requests),), self._request_ms())
+            sessions = replace(sessions, offer=self.trained.offers.at(times))
         # What was seen, and what the latest sessions have shown, if the rule excludes it.
         in_catalogue = latest.seen_ids >= 0
         rows, seen = latest.seen_owner[in_catalogue], latest.seen_ids[in_catalogue]

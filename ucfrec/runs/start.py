@@ -15,6 +15,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model import INITIAL
+from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -147,7 +148,7 @@ def begin(
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
         rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
         write_json(scratch / RULE, rule.as_dict())
-        for name in (ITEM_STATES, ITEMS, USERS):
+        for name in (ITEM_STATES, OFFERS, ITEMS, USERS):
             with suppress(FileNotFoundError):
                 shutil.copyfile(store.path / name, scratch / name)
         if store.has_items:
@@ -189,7 +190,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = torch.from_numpy(train.item_counts()).float()
-        policy.head.start_from(train.item_states.embeddings, counts)
+        policy.head.start_from(train.item_states.embeddings, counts, train.even_counts())
         if policy.head.exposure is not None:
             scaled = torch.from_numpy(returns_to_go) / policy.return_scale
             policy.head.exposure.start_from(train.item_states, scaled)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Shown
 from ucfrec.errors import damage_explained
@@ -216,6 +217,12 @@ class UserSimulator:
         steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
         values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
         return np.asarray(values, dtype=np.float32)
+
+    @property
+    def offer(self) -> Offer | None:
+        """What is on offer at the next step, at the time of the logged one; None for everything."""
+        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
+        return self._store.offer(self._episodes, steps)
 
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
         """Show one item (M,) in every session: rewards (M,), and positions of those that go on."""

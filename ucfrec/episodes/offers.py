@@ -48,22 +48,37 @@ class Offers:
         candidates = _no_rows(2) if sets is None else torch.from_numpy(sets)
         return cls(bounds[0], bounds[1], later, candidates)
 
+    @property
+    def intervals(self) -> IntArray:
+        """(3, I) int64 item, begin and end of all intervals that have a bound."""
+        bounded = torch.nonzero((self.begin != ALWAYS[0]) | (self.end != ALWAYS[1]))[:, 0]
+        first = torch.stack([bounded, self.begin[bounded], self.end[bounded]])
+        return torch.cat([first, self.later], dim=1).numpy()
+
     def at(self, times: Tensor, sets: Tensor | None = None) -> "Offer":
         """What was on offer in M decisions: times (M,) int64 ms, and numbers (M,) of their sets of
         candidates, −1 or None for all items."""
         return Offer(self, times, sets)
+
+    def count_unavailable(self, items: IntArray, times: IntArray) -> int:
+        """How many of the items (N,) are not available at times (N,) ms; −1 is no item."""
+        listed = items >= 0
+        offer = self.at(torch.from_numpy(times[listed].astype(np.int64)))
+        has_item = offer.has(torch.from_numpy(items[listed].astype(np.int64)))
+        return int((~has_item).sum())
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""
         save_tensors(path, vars(self), {})
 
     @classmethod
-    def load(cls, path: Path, n_items: int) -> "Offers":
+    def load(cls, path: Path, n_items: int | None = None) -> "Offers":
         """Read a file that `save` wrote; an InputError if it is missing, damaged or of a catalogue
-        of another size than `n_items`."""
+        of another size than `n_items`, or any for None."""
         tensors, _ = load_tensors(path)
         with damage_explained(path, REMEDY):
             offers = cls(**tensors)
+            n_items = len(offers.begin) if n_items is None else n_items
             shapes = {"begin": (n_items,), "end": (n_items,), "later": (3, None), "sets": (2, None)}
             for name, (first, *_) in shapes.items():
                 tensor = tensors[name]
@@ -95,8 +110,18 @@ class Offer:
 
     def has(self, items: Tensor) -> Tensor:
         """(M,) bool, whether one item (M,) of each decision was on offer."""
-        distinct, columns = torch.unique(items, return_inverse=True)
-        return self.mask(distinct).gather(1, columns.unsqueeze(1))[:, 0]
+        offers, times = self.offers, self.times
+        offered = (offers.begin[items] <= times) & (times < offers.end[items])
+        item, begin, end = offers.later
+        first, last = (torch.searchsorted(item, items, right=right) for right in (False, True))
+        for place in range(int((last - first).max()) if len(items) else 0):
+            at = (first + place).clamp(max=len(item) - 1)
+            offered |= (first + place < last) & (begin[at] <= times) & (times < end[at])
+        if self.sets is not None:
+            size = len(offers.begin)
+            keys, members = self.sets * size + items, offers.sets[0] * size + offers.sets[1]
+            offered &= (self.sets < 0) | torch.isin(keys, members)
+        return offered
 
     def mask(self, items: Tensor | None = None) -> Tensor:
         """(M, L) bool, whether `items` (L,) int64, ascending, each once, were on offer; None for

@@ -1,5 +1,6 @@
 """Columns of a store, memory-mapped or in memory, and views of its episodes."""
 
+import math
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import replace
@@ -426,16 +427,36 @@ class EpisodeView:
     def even_counts(self) -> Tensor | None:
         """(n_items,) float32 expected `item_counts` of even draws from what was on offer, from some
         of the steps if they are many; None without offers."""
-        n_items = len(self.item_states.embeddings) if self.has_items else 1
-        stride = -(-self.n_steps * n_items // _OFFERED)
-        numbers, counts = np.arange(0, self.n_steps, stride), torch.zeros(n_items)
-        for part in np.array_split(numbers, -(-len(numbers) * n_items // _BATCH_STEPS) or 1):
-            offer = self.offer(*self.locate(part))
+        counts, parts = torch.zeros(len(self.item_states.embeddings)), 0
+        for offer, _ in self._sample_offers():
             if offer is None:
                 return None
             offered = offer.mask().float()
             counts += (offered / offered.sum(1, keepdim=True).clamp(min=1)).sum(0)
-        return counts * (self.n_steps / max(1, len(numbers)))
+            parts += len(offered)
+        return counts * (self.n_steps / max(1, parts))
+
+    def mean_loss(self, scores: Tensor) -> float:
+        """Mean −log softmax (nats), over what was on offer, of the scores (n_items,) of the items
+        shown, from some of the steps if they are many; NaN without steps."""
+        losses = []
+        for offer, items in self._sample_offers():
+            if offer is None:
+                items = torch.from_numpy(self.column(schema.ITEM)).long()
+                return -float(scores.log_softmax(0)[items].double().mean())
+            offered = offer.mask().scatter(1, items.unsqueeze(1), True)
+            logs = scores.masked_fill(~offered, -torch.inf).log_softmax(1)
+            losses.append(-logs.gather(1, items.unsqueeze(1)))
+        return float(torch.cat(losses).double().mean()) if losses else math.nan
+
+    def _sample_offers(self) -> Iterator[tuple[Offer | None, Tensor]]:
+        """What was on offer at evenly spaced steps, and the items shown, some at a time."""
+        n_items = len(self.item_states.embeddings)
+        numbers = np.arange(0, self.n_steps, -(-self.n_steps * n_items // _OFFERED) or 1)
+        for part in np.array_split(numbers, -(-len(numbers) * n_items // _BATCH_STEPS) or 1):
+            episodes, steps = self.locate(part)
+            items = self.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+            yield self.offer(episodes, steps), torch.from_numpy(items)
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""

@@ -73,7 +73,8 @@ def explain(
     Raises:
         InputError: the rule does not fit the policy, or an item of the history is not known.
     """
-    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen)
+    at = None if trained.offers is None else int(user.timestamps.max(initial=0))
+    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen, at=at)
     # The user's latest session, before the step that is decided.
     numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)

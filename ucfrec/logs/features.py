@@ -11,7 +11,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, OFFERS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
@@ -32,6 +32,8 @@ from ucfrec.logs.typed import cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+    from ucfrec.episodes.offers import Offers
 
 CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
@@ -108,22 +110,34 @@ def _split_times(connection: duckdb.DuckDBPyConnection, name: str, table: Featur
     )
 
 
-def read_intervals(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> IntArray | None:
-    """(3, I) number of an item and the ms from and until which it is available, of feature tables;
-    None if none of them says."""
-    created = {row[0] for row in connection.sql("SHOW TABLES").fetchall()}
-    tables = [f"{name}_times" for name in names if f"{name}_times" in created]
-    if not tables:
+def _list_times(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> list[str]:
+    """The tables of times that belong to feature tables."""
+    created = {name for (name,) in connection.sql("SHOW TABLES").fetchall()}
+    return [f"{name}_times" for name in names if f"{name}_times" in created]
+
+
+def read_offers(
+    connection: duckdb.DuckDBPyConnection, names: Sequence[str], n_items: int, store: Path | None
+) -> "Offers | None":
+    """When the items of a store are available, as of feature tables; items that these lack as in
+    the older `store`. None where nobody says."""
+    tables = _list_times(connection, names)
+    has_older = store is not None and (store / OFFERS).is_file()
+    if not tables and not has_older:
         return None
-    low, high = ALWAYS
-    rows = connection.sql(
-        " UNION ALL ".join(
-            f"SELECT number::BIGINT AS number, coalesce(begin, {low}) AS begin, "
-            f"coalesce(until, {high}) AS until FROM items JOIN {name} ON {schema.ITEM_ID} = id"
-            for name in tables
-        )
-    ).fetchnumpy()
-    return np.stack([rows[name].astype(np.int64) for name in ("number", "begin", "until")])
+    from ucfrec.episodes.offers import Offers  # imports torch
+
+    intervals, (low, high) = np.zeros((3, 0), dtype=np.int64), ALWAYS
+    for name in tables:
+        rows = connection.sql(
+            f"SELECT number::BIGINT, coalesce(begin, {low}), coalesce(until, {high}) "
+            f"FROM items JOIN {name} ON {schema.ITEM_ID} = id"
+        ).fetchnumpy()
+        intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
+    if store is not None and has_older:
+        older = Offers.load(store / OFFERS).intervals
+        intervals = np.hstack([intervals, older[:, ~np.isin(older[0], intervals[0])]])
+    return Offers.of(n_items, intervals)
 
 
 def _read_part(
@@ -255,10 +269,10 @@ def _cast_id(key: str, key_type: str, id_type: str) -> str:
 def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> str:
     """A digest of every id and value of feature tables, in whatever order their rows are."""
     digest = hashlib.sha256()
-    for name in names:
+    for name in [*names, *_list_times(connection, names)]:
         columns = connection.sql(f"DESCRIBE {name}").fetchall()
         digest.update(repr([column[:2] for column in columns]).encode())
-        rows = connection.sql(f"SELECT * FROM {name} ORDER BY id")
+        rows = connection.sql(f"SELECT * FROM {name} ORDER BY ALL")
         for batch in rows.to_arrow_reader(BATCH_ROWS):
             for column in batch.columns:
                 if str(column.type) == "double":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, InstanceOf
 
@@ -27,7 +27,7 @@ from ucfrec.logs.features import (
     feature_digest,
     load_features,
     note_unread_features,
-    read_intervals,
+    read_offers,
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
@@ -35,6 +35,9 @@ from ucfrec.logs.rows import SortedRows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.offers import Offers
 
 
 @settings_table("")
@@ -151,8 +154,11 @@ def prepare(
             explain_errors(log.rows.log.connection, log.rows.log.tables, out.parent),
         ):
             typed, report = log.rows.log, log.report
+            offers = log.read_offers(None)
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(log.rows, log.cut, folder, bar)
+                writer = sessions.write_steps(log.rows, log.cut, folder, bar, offers=offers)
+            if offers is not None:
+                offers.save(folder / OFFERS)
             ids = sessions.write_ids(typed, folder)
             for name, tables in log.features.items():
                 if tables:
@@ -167,11 +173,6 @@ def prepare(
 
                 encoded = encode_ids(typed.connection, log.features)
                 write_item_states(folder, log.scratch, encoded, options.embedding_size)
-                intervals = read_intervals(typed.connection, log.features[schema.ITEM_ID])
-                if intervals is not None:
-                    from ucfrec.episodes.offers import Offers  # imports torch
-
-                    Offers.of(len(encoded.item_counts), intervals).save(folder / OFFERS)
             if like is not None:
                 sessions.write_episode_users(typed, folder / sessions.EPISODE_USERS)
             record.seal(folder)
@@ -200,6 +201,14 @@ class PreparedLog:
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
+
+    def read_offers(self, store: Path | None) -> "Offers | None":
+        """When items are available; of those that are in a `store` alone, as it says."""
+        if schema.ITEM_ID not in self.features:
+            return None
+        connection, names = self.rows.log.connection, self.features[schema.ITEM_ID]
+        ((n_items,),) = connection.sql("SELECT count(*) FROM items").fetchall()
+        return read_offers(connection, names, n_items, store)
 
 
 @contextmanager

@@ -37,6 +37,7 @@ def recommend_with_spark(
     filter_seen: bool = True,
     skip_unknown: bool = False,
     new_session: bool = False,
+    at: str | float | None = None,
     seed: int = 0,
     memory_limit: str = "2GB",
 ) -> int:
@@ -70,6 +71,7 @@ def recommend_with_spark(
             filter_seen=filter_seen,
             skip_unknown=skip_unknown,
             new_session=new_session,
+            at=at,
             seed=seed,
         )
         exposed = None if exposures is None else parts[1]

@@ -1,6 +1,5 @@
 """A run begins: its episodes, its record, and its policy, untrained or warm."""
 
-import math
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -154,12 +153,13 @@ def begin(
         if store.has_items:
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
-            items = torch.from_numpy(validation.column(schema.ITEM)).long()
-            # As the bias of `ItemHead` is initialised.
-            log_shares = torch.log((counts.shown + 1) / (counts.shown + 1).sum())
             entries["reference_losses"] = {
-                "uniform": math.log(len(counts.shown)),
-                "popularity": -float(log_shares[items].double().mean()),
+                name: validation.mean_loss(scores)
+                for name, scores in (
+                    ("uniform", torch.zeros(len(counts.shown))),
+                    # As the bias of `ItemHead` is initialised.
+                    ("popularity", torch.log(counts.shown + 1.0)),
+                )
             }
         RunRecord.of(entries, out / RUN).seal(scratch)
 

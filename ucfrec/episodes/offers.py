@@ -113,7 +113,7 @@ class Offer:
         offers, times = self.offers, self.times
         offered = (offers.begin[items] <= times) & (times < offers.end[items])
         item, begin, end = offers.later
-        first, last = (torch.searchsorted(item, items, right=right) for right in (False, True))
+        first, last = (torch.searchsorted(item.contiguous(), items, right=r) for r in (False, True))
         for place in range(int((last - first).max()) if len(items) else 0):
             at = (first + place).clamp(max=len(item) - 1)
             offered |= (first + place < last) & (begin[at] <= times) & (times < end[at])

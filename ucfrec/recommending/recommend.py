@@ -103,12 +103,7 @@ def recommend(
         excluded = torch.ones(len(trained.items), dtype=torch.bool)
         allowed = candidate_numbers(trained.items, ids, skip_unknown)
         excluded[torch.from_numpy(allowed)] = False
-    if trained.offers is not None and not trained.offers.at(chooser.request_times(1)).mask().any():
-        time = pd.Timestamp(int(chooser.request_times(1)), unit="ms")
-        raise InputError(
-            f"{trained.folder}: no item is available at {time:%Y-%m-%d %H:%M} UTC; give the time "
-            "of requests with --at (at=... in Python), or a newer table of items to ucfrec update"
-        )
+    _require_available(trained, chooser.request_times(1), excluded)
 
     def to_frame(batch: Histories) -> pd.DataFrame:
         histories = batch.with_numbers(trained.items, filter_seen)
@@ -133,6 +128,19 @@ def recommend(
         )
 
     return map(to_frame, remaining)
+
+
+def _require_available(trained: TrainedPolicy, time: Tensor, excluded: Tensor | None) -> None:
+    """Check that some item, or candidate, is available at a time (1,) in ms."""
+    if trained.offers is None:
+        return
+    offered = trained.offers.at(time).mask()
+    if not (offered if excluded is None else offered & ~excluded).any():
+        clock = pd.Timestamp(int(time), unit="ms")
+        raise InputError(
+            f"{trained.folder}: no item is available at {clock:%Y-%m-%d %H:%M} UTC; give the time "
+            "of requests with --at (at=... in Python), or a newer table of items to ucfrec update"
+        )
 
 
 def _read_time(at: str | float | None) -> int | None:

@@ -18,7 +18,6 @@ import pandas as pd
 from ucfrec.commands.cli import main as ucfrec
 from ucfrec.logs.mapping import log_files
 from ucfrec.results.rows import append_rows, read_results
-from ucfrec.runs.record import read_record
 from ucfrec_simulators.session_env import data_folder
 
 SETTINGS = ("train.steps=2000", "policy.dim=64")
@@ -87,9 +86,7 @@ def main() -> None:
             replace(row, **about, task="kuairand", conditions={"days": days, "k": row["k"]})
             for row in read_results(folder.with_suffix(".json"))
         ]
-        append_rows(results, [row for row in rows if row.config_hash is None])
-        config = read_record(folder).settings
-        append_rows(results, [row for row in rows if row.config_hash], config)
+        append_rows(results, rows)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ Numbers have at most three significant digits. The page names the commits that m
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,14 @@ from typing import Final
 
 import numpy as np
 
+from ucfrec.benchmark.tables import (
+    BySeed,
+    index_by_seeds,
+    subtract,
+    summarise_logs,
+    summarise_tasks,
+    values_by_task,
+)
 from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.results.rows import ResultRow, latest, read_rows
 from ucfrec.results.statistics import Summary, grouped, summary
@@ -70,9 +78,7 @@ METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQU
 """Order of the lines."""
 NEAR = 0.05
 """Share of the best score by which control's scores may be lower and still be bold."""
-_Seeds = tuple[int | None, int | None]
 _Files = Mapping[str, Sequence[ResultRow]]
-_Values = Mapping[_Seeds, float]
 
 
 def fill(text: str, subsequent_indent: str = "") -> str:
@@ -110,7 +116,7 @@ def level(sample: Summary, standard_error: bool = False) -> str:
     return rounded(sample.mean) + (error(spread, sample.mean) if sample.count > 1 else "")
 
 
-def difference(sample: Summary, over_logs: Summary | None = None, unit: str = "") -> str:
+def difference(sample: Summary, of_logs: Summary | None = None, unit: str = "") -> str:
     """A mean difference ± its standard error, in brackets the error over the means of logs."""
     if not sample.count:
         return NONE
@@ -119,28 +125,9 @@ def difference(sample: Summary, over_logs: Summary | None = None, unit: str = ""
     known = sample.standard_error
     text = rounded(sample.mean, most=max(decimals(known, 2), 0), sign="+") + unit
     text += f" ± {rounded(known, 2)}{unit}"
-    if over_logs is not None and over_logs.count > 1:
-        text += f" ({rounded(over_logs.standard_error, 2)}{unit})"
+    if of_logs is not None and of_logs.count > 1:
+        text += f" ({rounded(of_logs.standard_error, 2)}{unit})"
     return text
-
-
-def by_seeds(rows: Iterable[ResultRow]) -> dict[_Seeds, float]:
-    """The value of each (log seed, training seed)."""
-    return {(row.log_seed, row.training_seed): row.value for row in rows}
-
-
-def minus(values: _Values, others: _Values) -> dict[_Seeds, float]:
-    """Differences for equal seeds; a value that no seed changes is compared with each."""
-    same = {seeds: value for seeds, value in values.items() if seeds in others}
-    if not same and len(values) == 1:
-        same = dict.fromkeys(others, *values.values())
-    return {seeds: value - others[seeds] for seeds, value in same.items()}
-
-
-def over_logs(differences: _Values) -> Summary:
-    """Summary of the means of logs."""
-    of_logs = grouped(differences.items(), lambda item: item[0][0]).values()
-    return summary(float(np.mean([value for _, value in own])) for own in of_logs)
 
 
 def pivot(rows: Sequence[ResultRow], cell: Callable[[str, str, Sequence[ResultRow]], str]) -> str:
@@ -160,13 +147,15 @@ def pivot(rows: Sequence[ResultRow], cell: Callable[[str, str, Sequence[ResultRo
 def minus_ucf(rows: Sequence[ResultRow]) -> Callable[[str, str, Sequence[ResultRow]], str]:
     """A cell of `pivot`: the return minus that of UCF of the same log and training seed."""
     ours = {
-        environment: by_seeds(row for row in own if row.method == "ucf")
+        environment: index_by_seeds(row for row in own if row.method == "ucf")
         for environment, own in grouped(rows, lambda row: str(row.environment)).items()
     }
 
     def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        found = minus(by_seeds(group), ours[environment])
-        return NONE if method == "ucf" else difference(summary(found.values()), over_logs(found))
+        found = subtract(index_by_seeds(group), ours[environment])
+        return (
+            NONE if method == "ucf" else difference(summary(found.values()), summarise_logs(found))
+        )
 
     return cell
 
@@ -240,13 +229,15 @@ def estimates(rows: Sequence[ResultRow]) -> str:
 def augmentation(rows: Sequence[ResultRow]) -> str:
     """Paired differences of each kind of augmentation to none; over all sizes in percent."""
     lines: list[tuple[object, ...]] = []
-    percent: dict[tuple[float, str], dict[_Seeds, list[float]]] = {}
+    percent: dict[tuple[float, str], dict[tuple[int | None, int | None], list[float]]] = {}
     sizes = dict.fromkeys(_case(row) for row in rows)
     for (mood, size), own in sorted(grouped(rows, _case).items()):
-        arms = {name: by_seeds(group) for name, group in grouped(own, lambda r: r.method).items()}
+        arms = {
+            name: index_by_seeds(group) for name, group in grouped(own, lambda r: r.method).items()
+        }
         base = arms["none"]
         for arm in sorted(arms, key=AUGMENTATION.index):
-            found = minus(arms[arm], base) if arm != "none" else {}
+            found = subtract(arms[arm], base) if arm != "none" else {}
             lines.append((f"{mood:g}", size, arm, level(summary(arms[arm].values())), *_of(found)))
             for seeds, value in found.items():
                 share = 100 * value / summary(base.values()).mean
@@ -267,11 +258,11 @@ def _case(row: ResultRow) -> tuple[float, int]:
     return float(str(row.conditions["mood"])), int(str(row.conditions["sessions"]))
 
 
-def _of(found: _Values, unit: str = "") -> tuple[str, str]:
+def _of(found: BySeed, unit: str = "") -> tuple[str, str]:
     if not found:
         return NONE, NONE
     ahead = f"{sum(value > 0 for value in found.values())} of {len(found)}"
-    return difference(summary(found.values()), over_logs(found), unit), ahead
+    return difference(summary(found.values()), summarise_logs(found), unit), ahead
 
 
 def settings(rows: Sequence[ResultRow]) -> str:
@@ -291,7 +282,7 @@ def distractor(rows: Sequence[ResultRow]) -> str:
     cases = grouped(rows, lambda r: (str(r.environment), str(r.conditions["quantiles"]), r.method))
     for case, own in sorted(cases.items(), key=lambda item: (item[0][0], -float(item[0][1]))):
         clean, off, on = (
-            by_seeds(row for row in own if row.conditions["distractor"] == rate)
+            index_by_seeds(row for row in own if row.conditions["distractor"] == rate)
             for rate in (None, 0, 1)
         )
         lost = [100 * (1 - off[seeds] / value) for seeds, value in clean.items()]
@@ -303,12 +294,9 @@ def distractor(rows: Sequence[ResultRow]) -> str:
 
 def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> str:
     """Scores by data file, then each method's score minus that of `references`."""
-    tasks = list(dict.fromkeys(row.task for row in rows))
-    head = ("method", *(task.removesuffix("-zoo") for task in tasks), "mean")
-    of = grouped(rows, lambda row: (row.method, row.task))
-    methods = dict.fromkeys(row.method for row in rows)
-    values = {name: [by_seeds(of.get((name, task), ())) for task in tasks] for name in methods}
-    found = {name: _with_mean(own) for name, own in values.items()}
+    tasks = dict.fromkeys(row.task.removesuffix("-zoo") for row in rows)
+    head, values = ("method", *tasks, "mean"), values_by_task(rows, "score")
+    found = {name: summarise_tasks(own) for name, own in values.items()}
     columns = zip(*found.values(), strict=True)
     best = [max(each.mean for each in column if each.count) for column in columns]
 
@@ -322,28 +310,16 @@ def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> s
         markdown_table(head, lines),
     ]
     for reference in references:
-        less = {
-            name: _with_mean([minus(*pair) for pair in zip(own, values[reference], strict=True)])
+        shown = [
+            (name, *map(difference, summarise_tasks([*map(subtract, own, values[reference])])))
             for name, own in values.items()
             if name != reference
-        }
-        shown = [(name, *map(difference, own)) for name, own in less.items()]
+        ]
         parts += [
             f"Minus the score of `{reference}` of the same training seed, ± standard error:",
             markdown_table(head, [line for line in shown if set(line[1:]) != {NONE}]),
         ]
     return "\n\n".join(parts)
-
-
-def _with_mean(of_tasks: Sequence[_Values]) -> list[Summary]:
-    """Summaries of data files, then that of the mean over files of each seed; of one mean where
-    files differ in their seeds, of none where a file has no score."""
-    found = [summary(own.values()) for own in of_tasks]
-    if all(set(own) == set(of_tasks[0]) for own in of_tasks):
-        means = [float(np.mean([own[seeds] for own in of_tasks])) for seeds in of_tasks[0]]
-    else:
-        means = [float(np.mean([each.mean for each in found]))] if all(of_tasks) else []
-    return [*found, summary(means)]
 
 
 def robustness(rows: Sequence[ResultRow]) -> str:
@@ -563,7 +539,7 @@ SECTIONS = (
         "Control at equal training time",
         "The same files, rates and batches, but more steps for the faster methods (x2, x3, x8). "
         "UCF x2 and cloning x8 train about as long as DT and DC, UCF x3 as long as LSDT, half "
-        "as long again. The paper's UCF has 4,000 steps here too. `best-25` learns from the best "
+        "as long again. `ucf-paper` has 4,000 steps here too. `best-25` learns from the best "
         "quarter of the trajectories. UCF without augmentation is ahead of DT, DC and LSDT on all "
         "trajectories, and level with cloning the best quarter.",
         f"`{CONTROL} equal-time`",
@@ -612,11 +588,15 @@ SECTIONS = (
 
 
 NAMES = (
-    ("ucf", "UCF with augmented states, as in the paper; by default `train` augments nothing"),
+    ("ucf", "UCF with augmented states; by default `train` augments nothing"),
     ("ucf-wo-count", "UCF without augmentation, the default of `train`"),
     ("ucf-wo-arch", "DT on the augmented data of UCF"),
     ("ucf-plain", "UCF without the shared components"),
-    ("ucf-paper", "the paper's settings; `-algorithm-5` edits states as its Algorithm 5 says"),
+    (
+        "ucf-paper",
+        "the paper's losses and generator, at the budget's width, batch and rate; `-algorithm-5` "
+        "edits states as its Algorithm 5 says",
+    ),
     ("ucf-screened, -dropped", "interventions on the columns that screening flags; without them"),
     ("-wo-exposure, -wo-rule", "without exposure features; without a selected rule"),
     ("-actions, -both", "augmented actions; augmented states and actions"),

@@ -9,7 +9,7 @@ import pytest
 from pydantic import Field
 
 from ucfrec.errors import InputError
-from ucfrec.settings import SettingError, describe, require, settings_table
+from ucfrec.settings import SettingError, allowed_values, require, settings_table
 
 
 @settings_table("shop")
@@ -107,10 +107,6 @@ def test_positions_and_what_is_missing_are_named_too() -> None:
     assert caught.value.keys == ("shop.shelves", "shop.width")
 
 
-def test_fields_are_described_where_they_were_first_explained() -> None:
-    listed = {setting.key: setting for setting in describe("shop", Bakery(3))}
-    assert list(listed) == [f"shop.{f.name}" for f in fields(Bakery)]
-    assert listed["shop.shelves"].meaning == "How many there are."
-    assert (listed["shop.width"].meaning, listed["shop.width"].value) == ("Of each.", 0.25)
-    assert listed["shop.ovens"].meaning == "In the back."
-    assert listed["shop.hours"].allowed == "2 values, each a whole number, or unset"
+def test_types_and_ranges_are_said_in_words() -> None:
+    assert allowed_values(Bakery, "hours") == "2 values, each a whole number, or unset"
+    assert allowed_values(Bakery, "width") == "a number above 0"

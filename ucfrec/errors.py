@@ -37,13 +37,13 @@ def damage_explained(path: Path | str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except _FAULTS as error:
-        what = f"{type(error).__name__}: {error}"
-        raise InputError(f"{path} is damaged ({what:.200}); {remedy}") from None
+        what = f"{path} is damaged ({type(error).__name__}: {error})"
+        raise InputError(f"{what}; {remedy}") from None
 
 
 _FAULTS = (
-    *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
-    *(RuntimeError, RecursionError, ZeroDivisionError),
+    *(LookupError, TypeError, ValueError, AttributeError, OverflowError),
+    *(RuntimeError, ZeroDivisionError),
 )
 """What using values of another type, shape or range raises."""
 

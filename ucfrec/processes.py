@@ -48,12 +48,13 @@ def run_program(module: str) -> int:
     Until it is imported, Ctrl-C and TERM end the process with one line and status 130 or 143; once
     it has ended, they change nothing: without this, Python would give the signals back to the
     operating system while it ends, and the process would count as killed. Characters that the
-    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command.
+    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command. A
+    pipe gets each line when it is due.
     """
     _handle_signals(_end)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            stream.reconfigure(errors="replace", line_buffering=True)
     main: Callable[[], int] = import_module(module).main
     try:
         return main()
@@ -67,8 +68,11 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 
 def _handle_signals(handler: Any) -> dict[signal.Signals, Any]:
-    """Set the handler of Ctrl-C and TERM; returns those that they had."""
+    """Set the handler of Ctrl-C and TERM; returns those that they had. HUP, of a terminal that is
+    closed, counts as TERM, unless it is ignored, as under nohup."""
     ending = (signal.SIGINT, signal.SIGTERM)
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
     return {number: signal.signal(number, handler) for number in ending}
 
 

@@ -4,17 +4,14 @@ The annotation of a field gives its type and range, the assignment its default, 
 below it its meaning; error messages and `ucfrec settings` show all three.
 """
 
-import ast
 import difflib
 import inspect
 import math
 import operator
 import reprlib
-import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, fields
 from functools import partial, wraps
-from itertools import pairwise
 from numbers import Real
 from types import NoneType, UnionType
 from typing import (
@@ -22,7 +19,6 @@ from typing import (
     Any,
     Final,
     Literal,
-    NamedTuple,
     ParamSpec,
     TypeVar,
     Union,
@@ -69,15 +65,6 @@ class SettingError(InputError):
         self.keys = keys
 
 
-class Setting(NamedTuple):
-    """One field of a table: `table.field`, its value, type and range in words, and docstring."""
-
-    key: str
-    value: Any
-    allowed: str
-    meaning: str
-
-
 @dataclass_transform(frozen_default=True, field_specifiers=(Field, field))
 def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     """A decorator that makes a class a frozen dataclass with validated fields.
@@ -114,31 +101,10 @@ def require(holds: bool, message: str, *keys: str) -> None:
         raise SettingError(message, *keys)
 
 
-def describe(name: str, table: Any) -> Iterator[Setting]:
-    """Describe every field of `table`, whose keys begin with `name`.
-
-    A field that a subclass redefines without a docstring has the meaning given by its base class.
-    """
-    meanings: dict[str, str] = {}
-    for base in filter(is_table, reversed(type(table).__mro__)):
-        meanings |= _read_docstrings(base)
-    for key, info in type(table).__pydantic_fields__.items():
-        meaning = " ".join(meanings.get(key, "").split())
-        allowed = _allowed(info.annotation, info.metadata)
-        yield Setting(f"{name}.{key}", getattr(table, key), allowed, meaning)
-
-
-def _read_docstrings(table: type) -> dict[str, str]:
-    """Field to the docstring below it; read when it is shown, as reading all takes a moment."""
-    (source,) = ast.parse(textwrap.dedent(inspect.getsource(table))).body
-    assert isinstance(source, ast.ClassDef)
-    return {
-        field.target.id: text.value.value
-        for field, text in pairwise(source.body)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
-        if isinstance(text.value.value, str)
-    }
+def allowed_values(table: Any, name: str) -> str:
+    """Type and range, in words, of a field of a table."""
+    info = table.__pydantic_fields__[name]
+    return _allowed(info.annotation, info.metadata)
 
 
 is_table: Final = is_pydantic_dataclass
@@ -169,7 +135,7 @@ def _setting_error(
     if field_name not in infos:
         hint = nearest(field_name, list(infos))
         return SettingError(f"{name or table.__name__} has no field {field_name!r}; {hint}", key)
-    allowed = _allowed(infos[field_name].annotation, infos[field_name].metadata)
+    allowed = allowed_values(table, field_name)
     value = " ".join(repr(values[field_name]).split()) if field_name in values else "missing"
     value = value if len(value) <= 60 else f"{value[:57]}…"
     return SettingError(f"{key} is {value}; it must be {allowed}", key)

@@ -31,23 +31,15 @@ class SyntheticCatalog(SessionsEnv):
     Observation (n_tags + 4,): the user's tastes and factors plus noise that is fixed for the user.
     `info["user_id"]` (N,): the user of the next step, 0 to n_users − 1.
 
-    With `mood` above 0, the log is confounded. Every session has a hidden mood, good or bad with
-    equal chances, which neither observations nor info reveal. A good mood raises the log-odds of a
-    click on every item by `mood`, a bad one lowers them by as much; and `mixture`, as if it sensed
-    the mood, shows items of even tags more often in a good mood and of odd tags in a bad one
-    (`SoftmaxGuess`). So in the log even tags have higher rewards, and showing them causes nothing.
-    Which policy is best does not change: the mood moves all items alike.
-
     Args:
         num_envs: number of parallel sessions, N.
         n_items, n_tags, n_users: sizes of the environment.
         boredom_window: items among which a tag may occur only once.
         max_turn: largest number of steps of a session.
         environment_seed: seed of users and items; independent of the seed of `reset`.
-        mood: shift of the log-odds by the hidden mood of a session; 0 for no moods.
 
     Raises:
-        InputError: fewer tags than `boredom_window`, fewer items than tags, or a mood below 0.
+        InputError: fewer tags than `boredom_window`, or fewer items than tags.
     """
 
     def __init__(
@@ -59,15 +51,12 @@ class SyntheticCatalog(SessionsEnv):
         boredom_window: int = 4,
         max_turn: int = 20,
         environment_seed: int = 0,
-        mood: float = 0.0,
     ) -> None:
         if not boredom_window <= n_tags <= n_items:
             raise InputError(
                 f"boredom_window ≤ n_tags ≤ n_items must hold, got {boredom_window}, {n_tags}, "
                 f"{n_items}"
             )
-        if not mood >= 0:
-            raise InputError(f"mood is {mood}; give 0 or more")
         environment = np.random.default_rng([environment_seed, 31])
         self.tags: IntArray = environment.permutation(np.arange(n_items) % n_tags)
         """(n_items,) tag of each item."""
@@ -78,12 +67,9 @@ class SyntheticCatalog(SessionsEnv):
         match = factors @ environment.normal(0, 1, (FACTORS, n_items)) / np.sqrt(FACTORS)
         quality = environment.normal(0, 0.5, n_items)
         self.logits = -2.5 + tastes[:, self.tags] + 0.7 * match + quality
-        """(n_users, n_items) log-odds of a click in no mood."""
-        self.mood = mood
-        shifts = (-mood, mood) if mood else (0.0,)
-        self._by_mood = np.stack([1 / (1 + np.exp(-(self.logits + shift))) for shift in shifts])
-        self.click_probabilities: Float64Array = self._by_mood.mean(axis=0)
-        """(n_users, n_items) probabilities of a click, over all moods."""
+        """(n_users, n_items) log-odds of a click."""
+        self.click_probabilities: Float64Array = 1 / (1 + np.exp(-self.logits))
+        """(n_users, n_items) probabilities of a click."""
         features = np.concatenate([tastes, factors], axis=1)
         self._features = (features + environment.normal(0, 0.5, features.shape)).astype(np.float32)
         self.boredom_window, self.max_turn = boredom_window, max_turn
@@ -91,8 +77,6 @@ class SyntheticCatalog(SessionsEnv):
         """(N,) user of each session."""
         self.turns: IntArray = np.zeros(num_envs, dtype=np.int64)
         """(N,) number of items shown so far."""
-        self.good_mood: IntArray = np.zeros(num_envs, dtype=np.int64)
-        """(N,) 1 in sessions of a good mood, 0 in others; 0 in all without moods."""
         self.recent_tags: IntArray = np.full((num_envs, boredom_window - 1), NO_TAG)
         """(N, boredom_window − 1) tags of the last items, the latest last; padded with −1."""
         super().__init__(
@@ -120,12 +104,10 @@ class SyntheticCatalog(SessionsEnv):
         self.users[rows] = self.np_random.integers(len(self.logits), size=len(rows))
         self.turns[rows] = 0
         self.recent_tags[rows] = NO_TAG
-        if self.mood:
-            self.good_mood[rows] = self.np_random.integers(2, size=len(rows))
 
     def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         tags = self.tags[actions]
-        chances = self._by_mood[self.good_mood, self.users, actions]
+        chances = self.click_probabilities[self.users, actions]
         clicks = self.np_random.random(self.num_envs) < chances
         bored = (self.recent_tags == tags[:, None]).any(axis=1)
         self.recent_tags = np.column_stack([self.recent_tags, tags])[:, 1:]
@@ -171,9 +153,6 @@ class Rotation(Memoryless):
 class SoftmaxGuess(Memoryless):
     """Softmax policy over erroneous log-odds with uniform exploration; its propensities are exact.
 
-    In an environment with moods, it adds `mood` to the log-odds of items of even tags, or, in
-    sessions of a bad mood, of odd tags; its propensities are those given the mood.
-
     Args:
         error: standard deviation of the fixed error of each (user, item) log-odds.
         temperature: temperature of the softmax.
@@ -197,15 +176,11 @@ class SoftmaxGuess(Memoryless):
         errors = np.random.default_rng([0, 5, round(1000 * error)])
         self._guess = environment.logits + error * errors.standard_normal(environment.logits.shape)
 
-    def probabilities(self, live: BoolArray | None = None) -> Float64Array:
-        """(N, n_items) probability of each item in the next step of the sessions that `live` (N,)
-        marks; None for all."""
-        environment, rows = self._environment, slice(None) if live is None else live
-        repeated = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)
-        scores = self._guess[environment.users[rows]] - self._variety * repeated
-        if environment.mood:
-            favoured = (environment.tags % 2 == 0) == (environment.good_mood[rows] == 1)[:, None]
-            scores = scores + environment.mood * favoured
+    def probabilities(self) -> Float64Array:
+        """(N, n_items) probability of each item in the next step."""
+        environment = self._environment
+        repeated = (environment.recent_tags[:, :, None] == environment.tags).any(axis=1)
+        scores = self._guess[environment.users] - self._variety * repeated
         scores = scores / self._temperature
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
         greedy = weights / weights.sum(axis=1, keepdims=True)
@@ -264,18 +239,12 @@ def softmax(env: AnyEnv, seed: int) -> SoftmaxGuess:
     return SoftmaxGuess(_catalog(env), seed, **knobs)
 
 
-def simulator(mood: float = 0.0) -> Simulator:
-    """The catalogue as a simulator; with `mood` above 0 its logs are confounded."""
-    return Simulator(
-        summary="built-in users and 200 tagged items with a known best policy: one item a step, "
-        "clicks",
-        make=lambda num_envs, folder: SyntheticCatalog(num_envs, mood=mood),
-        behaviors={
-            **{"random": Uniform, "popular": popular, "mixture": mixture},
-            **{"softmax": softmax, "optimal": optimal},
-        },
-        feedback="is_click",
-    )
-
-
-SIMULATOR: Final = simulator()
+SIMULATOR: Final = Simulator(
+    summary="built-in users and 200 tagged items with a known best policy: one item a step, clicks",
+    make=lambda num_envs, folder: SyntheticCatalog(num_envs),
+    behaviors={
+        **{"random": Uniform, "popular": popular, "mixture": mixture},
+        **{"softmax": softmax, "optimal": optimal},
+    },
+    feedback="is_click",
+)

@@ -214,8 +214,5 @@ def test_the_best_are_found_wherever_they_lie(rows: int, n: int, k: int) -> None
         torch.randn(rows, n, generator=generator).masked_fill(torch.arange(n) > k, -torch.inf),
         torch.randint(3, (rows, n), generator=generator).float(),  # most are equal
     ):
-        found = best_items(scores, k)
-        expected = scores.sort(dim=1, descending=True).values[:, :k]
-        assert torch.equal(scores.gather(1, found), expected)
-        assert torch.equal(found[:, 0], scores.argmax(1))
-        assert all(len(set(row)) == k for row in found.tolist())
+        expected = scores.sort(dim=1, descending=True, stable=True).indices[:, :k]
+        assert torch.equal(best_items(scores, k), expected)

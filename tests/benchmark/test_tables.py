@@ -1,21 +1,17 @@
-"""Tables and plots of the benchmarks are what their rows say."""
+"""Tables of the benchmarks are what their rows say."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.support.result_rows import distractor_rows, result_row
 from ucfrec.benchmark.tables import (
-    DISTRACTOR_RATES,
     average_seeds,
     difference_table,
     distractor_table,
     method_table,
-    plot_distractor,
-    plot_methods,
     score_table,
     select_best_target,
 )
@@ -130,20 +126,3 @@ def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
     one = method_table([*rows("dt", {(0, 0): 9.0}), *rows("ucf", ours)]).splitlines()[2]
     assert one.endswith("| -1 |")
     assert method_table(rows("dt", other)).endswith("| – |")
-
-
-def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
-    values = dict.fromkeys(DISTRACTOR_RATES, (1.0, 2.0))
-    rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
-    clean = [row for row in rows if row.conditions["distractor"] is None]
-    for plot, given, name in (
-        (plot_methods, clean, "methods"),
-        (plot_distractor, rows, "distractor"),
-    ):
-        made = plot(given, tmp_path)
-        assert made == [tmp_path / f"{name}-w.png", tmp_path / f"{name}-w.svg"]
-        drawn = made[1].read_text()
-        assert all(text in drawn for text in (">ucf<", ">dt<"))
-        plot(given, tmp_path)
-        assert made[1].read_text() == drawn
-    assert plot_distractor(clean, tmp_path) == []

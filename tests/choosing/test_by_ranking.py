@@ -83,8 +83,8 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
 
 
 def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(folder: Path) -> None:
-    found = chosen(folder, 50.0, 0.0, 1000.0)
-    ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
+    found, candidates = chosen(folder, 50.0, 0.0, 1000.0)
+    ranked = [each for each in candidates if isinstance(each, RankedRule)]
     overlaps = {each.rule.reward_weight: each.gain >= each.gain_error for each in ranked}
     assert [*overlaps.items()][:2] == [(0.0, True), (1000.0, False)]
     assert overlaps[found.rule.reward_weight]
@@ -95,8 +95,8 @@ def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(fold
 
 
 def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -> None:
-    found = chosen(folder, -1e4, 0.0, 1.0)
-    ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
+    found, candidates = chosen(folder, -1e4, 0.0, 1.0)
+    ranked = [each for each in candidates if isinstance(each, RankedRule)]
     assert not any(each.gain >= each.gain_error for each in ranked)
     most = max(ranked, key=lambda each: each.gain)
     enough = most.gain - most.gain_error
@@ -173,21 +173,21 @@ def test_evidence_is_what_off_policy_evaluation_finds(evident: Path) -> None:
 
 
 def test_only_rules_that_the_log_can_evaluate_are_chosen(evident: Path) -> None:
-    free, bound = (choose_by_simulation(problem(evident, each)) for each in (0, 12))
-    assert all(each.rule in {one.rule for one in bound.candidates} for each in free.candidates)
-    chosen = next(each for each in bound.candidates if each.rule == bound.rule)
+    (_, free), (found, bound) = (choose_by_simulation(problem(evident, n)) for n in (0, 12))
+    assert all(each.rule in {one.rule for one in bound} for each in free)
+    chosen = next(each for each in bound if each.rule == found.rule)
     assert chosen.effective_users >= 12
-    assert chosen.value <= max(each.value for each in bound.candidates)
-    best = max(bound.candidates, key=lambda each: each.value)
+    assert chosen.value <= max(each.value for each in bound)
+    best = max(bound, key=lambda each: each.value)
     assert best.effective_users < 12
     search = RuleSearch(problem(evident, 10**6))
-    tried = search.simulate([each.rule for each in bound.candidates])
+    tried = search.simulate([each.rule for each in bound])
     assert not any(search.is_allowed(each) for each in tried)
     assert set(search.level(tried)) <= {*filter(search.is_supported, tried)}
     assert chosen.evidence is not None
     known = replace(chosen, evidence=replace(chosen.evidence, effective_users=1e6))
     assert search.level([*tried, known]) == [known]
-    assert "too small to evaluate" in choose_by_simulation(problem(evident, 10**6)).warning
+    assert "too small to evaluate" in choose_by_simulation(problem(evident, 10**6))[0].warning
 
 
 def test_the_report_draws_what_a_bolder_rule_would_gain(evident: Path) -> None:

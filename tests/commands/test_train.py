@@ -1,5 +1,6 @@
 """`ucfrec settings`: every key, its default, range and meaning; and the way there."""
 
+import re
 from dataclasses import asdict
 
 import pytest
@@ -21,6 +22,8 @@ def test_every_key_stands_in_its_section_and_its_default_is_taken_back(policy: s
         cells = [[cell.strip() for cell in row if cell.strip()] for row in rows]
         assert [row[0] for row in cells] == [f"{name}.{key}" for key in asdict(config)[name]]
         assert all(len(row) == 3 for row in cells), cells
+        # Below each is what it means, also of those that another class has defined.
+        assert len(re.findall(r"\n  \S.*\n {6}\S", section)) == len(rows)
         overrides += [f"{row[0]}={row[1]}" for row in cells if row[1] != "unset"]
     assert resolve_config(policy, None, overrides) == config
 

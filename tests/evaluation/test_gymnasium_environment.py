@@ -127,9 +127,19 @@ def test_what_cannot_be_played_is_said(name: str, observe: tuple[str, ...], said
         environment(name, 1, observe)
 
 
+def test_a_namespace_is_imported_as_the_package_that_registers_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = f"import gymnasium, {MODULE} as m\ngymnasium.register('spaced/One-v0', lambda: m.Echo("
+    (tmp_path / "spaced.py").write_text(f"{code}m.ACTIONS['Discrete']))")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert GymnasiumEnvironment("spaced/One-v0", 1).single_action_space == spaces.Discrete(ITEMS)
+    for name in ("spaced/Two-v0", "absent/One-v0", "absent:spaced/One-v0", "a:b:One-v0"):
+        with pytest.raises(InputError, match=rf"^gymnasium:{name} cannot be made \(.*MODULE:ID$"):
+            GymnasiumEnvironment(name, 1)
+
+
 def test_a_missing_module_and_options_of_other_environments_are_refused() -> None:
-    with pytest.raises(InputError, match="No module named 'not_there'"):
-        GymnasiumEnvironment("not_there:X-v0", 1)
     with pytest.raises(InputError, match="are for gymnasium:ID; leave them out for synthetic-cat"):
         Environment("synthetic-catalog", observe=("step",)).simulator()
     name = f"gymnasium:{MODULE}:ucfrec-test/Box-v0"

@@ -130,6 +130,8 @@ def test_one_run_without_its_store_takes_a_pasted_history(explorer: Explorer) ->
     assert "only here" not in listed
     with pytest.raises(InputError, match="0 runs are named"):
         Explorer([])
+    with pytest.raises(InputError, match="does not exist"):
+        Explorer(explorer.runs, None, [Path("nowhere.json")])
 
 
 def fill(browser: Browser, field: str, value: str) -> None:

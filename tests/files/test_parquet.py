@@ -1,4 +1,4 @@
-"""Parquet files that claim too much, or hold something else than ids."""
+"""Parquet files that claim too much, or hold something else than ids; tables to write."""
 
 import gzip
 import os
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -15,7 +16,13 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import item_table
 from ucfrec.files import parquet
-from ucfrec.files.parquet import read_ids, require_plausible_rows, require_plausible_size
+from ucfrec.files.parquet import (
+    read_ids,
+    require_plausible_rows,
+    require_plausible_size,
+    write_frames,
+)
+from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.reporting.training import read_features
@@ -119,3 +126,34 @@ def test_a_log_that_compresses_as_logs_do_passes(
     require_plausible_size(path)
     path.write_bytes(path.read_bytes()[:-40])
     require_plausible_size(path)  # its reader says that it is cut
+
+
+# Tables to write.
+
+
+def test_a_table_is_of_the_kind_that_its_name_says(tmp_path: Path) -> None:
+    frames = [pd.DataFrame({"user_id": ["a", "b,"], "score": [0.1, 1e-300]}) for _ in range(2)]
+    readers = {"t": pd.read_parquet, "t.parquet": pd.read_parquet, "t.CSV": pd.read_csv}
+    for name, read in readers.items():
+        assert write_frames(tmp_path / name, frames, {"about": "it"}) == 4
+        pd.testing.assert_frame_equal(read(tmp_path / name), pd.concat(frames, ignore_index=True))
+    with pytest.raises(InputError, match="CSV has no lists, as in the column tags; name a file"):
+        write_frames(tmp_path / "tags.csv", [pd.DataFrame({"tags": [[1, 2]]})])
+    assert len([*tmp_path.iterdir()]) == 3
+
+
+@pytest.mark.parametrize("name", ["next.json", "next.csv.gz"])
+def test_tables_of_another_kind_are_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = ["--out", str(tmp_path / name)]
+    shown = ["none", "none.parquet", "--out", str(tmp_path / "a.csv"), "--exposures", out[1]]
+    for arguments in (
+        ["recommend", "none", "none.parquet", *out],
+        ["recommend", *shown],
+        ["score", "none", "none.parquet", *out],
+    ):
+        assert main(arguments) == 2
+        assert f"{name}: tables are written as Parquet or CSV; name a" in capsys.readouterr().err
+    with pytest.raises(InputError, match=f"{name}: tables are written as Parquet or CSV"):
+        join_feedback([tmp_path], [tmp_path], tmp_path / name, 1)

@@ -51,22 +51,16 @@ def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    "line",
     [
-        ("", "is not JSON"),
-        ("[" * 100_000, "is not JSON"),
-        ('{"step": 1, "loss": ' + "1" * 5000 + "}", "is not JSON"),
-        ("[1]", "is not a JSON object"),
-        ('{"loss": 1}', "no whole number of 0 or more as 'step'"),
-        ('{"step": true}', "no whole number"),
-        ('{"step": 1' + "0" * 30 + "}", "no whole number"),
-        ('{"step": 1, "loss": "low"}', "no number as 'loss'"),
-        ('{"step": 1, "loss": 1' + "0" * 400 + "}", "too large a number as 'loss'"),
+        *("", "[" * 100_000, '{"step": 1, "loss": ' + "1" * 5000 + "}", "[1]", '{"loss": 1}'),
+        *('{"step": true}', '{"step": 1.5}', '{"step": null}', '{"step": 1' + "0" * 30 + "}"),
+        '{"step": 1, "loss": "low"}',
     ],
 )
-def test_other_lines_are_named_in_one_line(tmp_path: Path, line: str, says: str) -> None:
+def test_other_lines_are_named_in_one_line(tmp_path: Path, line: str) -> None:
     (tmp_path / METRICS).write_text(f'{{"step": 1, "loss": 2}}\n{line}\n{{"step": 2}}\n')
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(InputError, match="is not a JSON object of numbers with a whole") as caught:
         read_metrics(tmp_path)
     assert f"{tmp_path / METRICS}, line 2," in str(caught.value)
     assert "\n" not in str(caught.value)

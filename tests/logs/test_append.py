@@ -17,7 +17,7 @@ from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.append import AppendOptions, append_logs
+from ucfrec.logs.append import AppendOptions, append_logs, find_end
 
 
 def rows_of(path: Path) -> list[tuple[int | str, int | str, int, float]]:
@@ -130,6 +130,40 @@ def test_a_window_forgets_the_sessions_that_ended_before(
     assert all(times[places[0] == e].max() >= cut for e in range(store.n_episodes))
     counts = store.split("train").item_counts()
     assert pq.read_table(out / "items.parquet")["train_count"].to_pylist() == [*counts]
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_fast_clock_neither_loses_rows_nor_counts_them_twice(tmp_path: Path, text: bool) -> None:
+    hour, old, new = 3_600_000, tagged_log(), later_log(seed=2)
+    logs = [old, new] = [old, new.assign(timestamp=new.timestamp - 20 * hour)]
+    old.loc[899, "timestamp"] += 60 * hour
+    new.loc[299, "timestamp"] += 50 * hour
+    if text:
+        logs = [log.astype({"user_id": str, "item_id": str}) for log in logs]
+    store_of(logs[0], tmp_path, None, reward="reward", session_by="gap", gap_minutes=120)
+    files = [write(log, tmp_path / f"{name}.parquet") for name, log in zip("ab", logs, strict=True)]
+    told = rf"store: 1 row\(s\) are after 2023-.*{old.timestamp[899]}.*300 new rows between"
+    window = AppendOptions(window_ms=5 * hour)
+    with pytest.warns(InputNote, match=told), pytest.warns(InputNote, match="the window ends"):
+        report = append_logs(tmp_path / "store", files, tmp_path / "recent", None, window)
+    cut = new.timestamp[:299].max() - 5 * hour
+    recent = [row for row in rows_in(*logs) if row[2] >= cut]
+    assert report["steps"] == 300
+    assert {*recent} <= {*rows_of(tmp_path / "recent")}
+    append_logs(tmp_path / "store", files, tmp_path / "grown")
+    assert rows_of(tmp_path / "grown") == rows_in(*logs)
+    with pytest.raises(InputError, match="all 1,200 rows are not newer than"):
+        append_logs(tmp_path / "grown", files, tmp_path / "again")
+
+
+def test_the_end_of_a_log_is_its_last_row_unless_the_rows_before_are_dense() -> None:
+    every_30_s, hour = np.arange(2880) * 30_000, 3_600_000
+    assert [find_end(every_30_s[:n]) for n in (1, 2, 9, 2880)] == [0, 30_000, 240_000, 86_370_000]
+    evening = np.append(every_30_s, every_30_s[-1] + np.arange(1, 20) * 300_000)  # a tenth as dense
+    assert find_end(evening) == evening.max()
+    for fast in ([1], [20], [1, 20], [2] * 5, np.linspace(3, 20, 100)):
+        late = every_30_s[: len(fast)] + 24 * hour + np.round(np.multiply(fast, hour)).astype(int)
+        assert find_end(np.append(late, every_30_s)) == every_30_s[-1]
 
 
 def test_propensities_may_begin_with_the_new_logs(grown: Path, tmp_path: Path) -> None:

@@ -339,6 +339,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     late.to_parquet(folder / "late.parquet")
     late.to_csv(folder / "late.csv", index=False)
     plain(late).to_parquet(folder / "plain.parquet")
+    # As `join` writes it; `uid` is feedback here.
+    times = {"timestamp": plain(late).timestamp.astype("datetime64[ms]").astype("int64")}
+    shown = {"position": 1, "run": "r", "rule": "d", "uid": 0, "agent": "person"}
+    plain(late).assign(**times, **shown).to_parquet(folder / "joined.parquet")
     paths = [str(folder / name) for name in ("log.parquet", "store", "run", "shop.toml")]
     assert main(["prepare", paths[0], "--mapping", paths[3], "--out", paths[1]]) == 0
     assert main(["train", paths[1], "--policy", "dt", "--out", paths[2], *TRAIN]) == 0
@@ -357,6 +361,12 @@ def test_a_later_log_is_read_as_the_first_whatever_its_names(folder: Path, log: 
     expected = scored(folder, "late.parquet", "--mapping", str(folder / "shop.toml"))
     assert 0 < len(expected) < 400
     pd.testing.assert_frame_equal(scored(folder, log), expected)
+
+
+def test_a_log_of_join_has_its_own_names_whatever_the_mapping_says(folder: Path) -> None:
+    expected, mapping = scored(folder, "plain.parquet"), ["--mapping", str(folder / "shop.toml")]
+    for more in ([], mapping, [*mapping, "--column", "timestamp=timestamp + position - 1"]):
+        pd.testing.assert_frame_equal(scored(folder, "joined.parquet", *more), expected)
 
 
 def test_a_given_column_or_condition_wins(folder: Path) -> None:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from tests.support.logs import START, list_users, random_log
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 
@@ -81,16 +81,22 @@ def test_columns_of_objects_that_arrow_would_change_or_not_take_are_refused(
         list(frame_histories(frame, LogMapping(), "reward", 7))
 
 
-def test_columns_of_types_that_are_not_read_are_left_out_with_a_note() -> None:
-    kinds = {
+def test_a_column_that_cannot_be_converted_is_refused_only_if_it_is_read() -> None:
+    periods = pd.Series(pd.period_range("2020", periods=2)).astype("category")
+    arrays = {
         "halves": pa.array([[np.float16(1)], None]),
         "wide": pa.array([Decimal(1), None], pa.decimal256(50, 3)),
         "nothing": pa.array([{}, {}], pa.struct([])),
         "spans": pa.array([(1, 2, 3), None], pa.month_day_nano_interval()),
     }
-    for name, values in kinds.items():
-        column = pd.Series(pd.arrays.ArrowExtensionArray(pa.chunked_array([values])))
+    pairs = pd.Series([(1, 2), (1, 3)]).astype("category")
+    kinds = {"cut": pd.cut(pd.Series([1, 2]), 2), "period": periods, "pairs": pairs}
+    for name, values in arrays.items():
+        kinds[name] = pd.Series(pd.arrays.ArrowExtensionArray(pa.chunked_array([values])))
+    for name, column in kinds.items():
         frame = random_log(2, users=1).assign(**{name: column}, reward=np.array([0.5, 1], "f2"))
-        with pytest.warns(InputNote, match=f"column {name} is left out: it is of type"):
-            (batch,) = frame_histories(frame, LogMapping(), "reward", 7)
+        (batch,) = frame_histories(frame, LogMapping(), "reward", 7)
         assert batch.rewards.tolist() == [0.5, 1.0]
+        mapping = LogMapping(where=f"len({name}) > 1")
+        with pytest.raises(InputError, match=f"histories: {name} is of type .*convert it"):
+            list(frame_histories(frame, mapping, "reward", 7))

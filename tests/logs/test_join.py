@@ -1,8 +1,12 @@
 """Exposures joined with feedback: every row of feedback counts once, for what it is about."""
 
+import time
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
+from unittest.mock import Mock
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -216,6 +220,34 @@ def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
     expected = {"feedback": [0, 1, 3, 1], "Seconds": [0, 9, 3, 4], "bought": [0, 1, 1, 0]}
     expected |= {name: first[name].tolist() for name in ("row", "page", "Free")}
     assert {name: both[name].tolist() for name in expected} == expected
+    disliked = feedback([(2, 10, 7, -1), (1, 10, 7, -1)], click="bought")
+    _, third = joined(
+        tmp_path, disliked, shown=(tmp_path / "log.parquet").rename(tmp_path / "second.parquet")
+    )
+    assert third.bought.tolist() == [0, 1, 1, -1]  # 0 is no feedback, in any order of joins
+
+
+@pytest.mark.parametrize(
+    ("error", "disk"), [("No space left", "{}"), ("IO Error: No space left", gettempdir())]
+)
+def test_a_full_disk_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: str, disk: str
+) -> None:
+    monkeypatch.setattr("ucfrec.logs.join.write_batches", Mock(side_effect=OSError(error)))
+    with pytest.raises(InputError, match=f"no space left on the disk of {disk.format(tmp_path)};"):
+        joined(tmp_path, feedback([(1, 10, 7, 1)]))
+
+
+def test_one_user_who_saw_one_item_very_often_takes_no_longer(tmp_path: Path) -> None:
+    rows = 40_000
+    shown = pd.DataFrame({"user_id": "guest", "item_id": 7, "timestamp": START + np.arange(rows)})
+    shown = shown.assign(request_id=shown.index.astype(str), position=1, propensity=0.5)
+    shown.assign(run="r", rule="d").to_parquet(tmp_path / "shown.parquet")
+    clicks = shown[["user_id", "item_id", "timestamp"]].assign(click=1)
+    begin = time.perf_counter()
+    report, log = joined(tmp_path, clicks, shown=tmp_path / "shown.parquet")
+    assert time.perf_counter() - begin < 20  # 800 million pairs would take minutes
+    assert (report.matched, log.feedback.tolist()) == (rows, [1] * rows)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +259,9 @@ def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
     ],
 )
 def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -> None:
-    with pytest.warns(InputNote, match="none of the 2 rows of feedback matches") as notes:
+    with pytest.warns(
+        InputNote, match=r"2 of 2 rows of feedback \(100%\) match no exposure"
+    ) as notes:
         joined(tmp_path, csv("click", "1", "1", time=time))
     note = str(notes[0].message)
     assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note

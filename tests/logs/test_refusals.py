@@ -94,6 +94,22 @@ def latin(folder: Path) -> None:
     validate([folder / "log.csv"], LogMapping())
 
 
+def nested(folder: Path) -> None:
+    values, kind = pa.array([1] * 400), pa.int64()
+    for _ in range(40):
+        kind = pa.list_(kind)
+        values = pa.ListArray.from_arrays(pa.array(range(401), pa.int32()), values, kind)
+    log = pa.Table.from_pandas(random_log()).append_column("tree", values)
+    pq.write_table(log, folder / "log.parquet")
+    validate([folder / "log.parquet"], LogMapping({"observation": "tree"}))
+
+
+def broken_link(folder: Path) -> None:
+    write(random_log(), folder / "logs" / "1.parquet")
+    (folder / "logs" / "2.parquet").symlink_to("not-fetched.parquet")
+    log_files([folder / "logs"])
+
+
 def dated(form: str, first: str = "2024-03-01", days: int = 11) -> pd.DataFrame:
     times = pd.Timestamp(first) + pd.to_timedelta(np.arange(400) * days // 400, unit="D")
     return random_log().assign(timestamp=times.strftime(form))
@@ -109,6 +125,16 @@ LOGS: dict[str, tuple[Act, str]] = {
         log_with(user_id=0.5),
         r"user_id \(user_id\) is DOUBLE.*BIGINT.*at most 15 digits: others would be rounded",
     ),
+    "rounded times": (
+        log_with(timestamp=(START + 9_000 * np.arange(400)).astype("f4")),
+        r"timestamp, which is FLOAT \(float32\): 400 of 400 values are 16,777,216 or more and ro",
+    ),
+    "rounded ids": (
+        log_with(mapping=LogMapping({"user_id": "uid::BIGINT"}), uid=[1.0] * 399 + [1e17]),
+        r"uid, which is DOUBLE \(float64\): 1 of 400 values are .* write them as int64",
+    ),
+    "lists in lists": (nested, "column tree has lists in lists, more than 16 levels deep"),
+    "a broken link": (broken_link, r"2\.parquet is a link to a file that does not exist; fetch"),
     "text reward": (log_with(reward="much"), r"reward \(reward\) is VARCHAR"),
     "seconds": (
         log_with(timestamp=START // 1000 + np.arange(400)),

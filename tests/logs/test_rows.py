@@ -59,7 +59,7 @@ def test_the_rows_that_are_kept_are_those_of_pandas(
     folder = None if in_memory else tmp_path
     with engine([path], tmp_path) as connection:
         tables = open_log_tables(connection, [path], LogMapping(), "reward", "gap")
-        log = open_log(tables, tmp_path)
+        log = open_log(tables)
         rows = sort_rows(log, None, duplicates, folder)
         batches = list(rows.file.read())
     assert len(batches) > 1
@@ -99,7 +99,7 @@ def test_long_rows_are_sorted_in_less_memory_than_they_take(tmp_path: Path) -> N
     assert numbers.nbytes > 80e6
     with engine([file], tmp_path, "40MB", threads=1) as connection:
         tables = open_log_tables(connection, [file], LogMapping(), "reward", "user")
-        log = open_log(tables, tmp_path)
+        log = open_log(tables)
         rows = sort_rows(log, None, "highest", tmp_path)
         order = np.concatenate([batch["row"] for batch in rows.file.read()])
         found = rows.observations.of_rows(order[9_000:9_100])

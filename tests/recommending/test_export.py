@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tests.recommending.test_responder import answered
 from tests.support.logs import store_of
@@ -28,16 +28,18 @@ from tests.support.served import (
 )
 from tests.support.tagged import tagged_log
 from ucfrec import Recommender
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.commands.cli import main
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.export import (
-    _CHUNK,
     DESCRIPTION,
     GRAPH,
     OUTPUTS,
+    _run_graph,
+    _start_runner,
+    _write_graph,
     export,
     find_best,
     measure_magnitude,
@@ -203,17 +205,22 @@ def test_what_scores_items_in_its_own_way_is_refused(tmp_path: Path, name: str) 
         responder(trained, engine=ONNXRUNTIME)
 
 
-@pytest.mark.parametrize("n", [1000, 2 * _CHUNK + 17])
-def test_the_best_of_chunks_are_the_best_of_all(n: int) -> None:
-    scores = torch.randn(3, n, generator=torch.Generator().manual_seed(0))
-    scores[1] = -torch.inf
-    scores[2, 5:] = -torch.inf
-    items, values = find_best(scores, 9)
+class _Best(nn.Module):
+    def forward(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        return find_best(scores, 9)
+
+
+def test_the_graph_finds_the_best_in_the_order_of_recommend(tmp_path: Path) -> None:
+    scores = torch.randn(4, 1000, generator=torch.Generator().manual_seed(0))
+    scores[1], scores[2, 5:] = -torch.inf, -torch.inf
+    scores[3] = (scores[3] / 2).round()  # many are equal
+    _write_graph(_Best(), {"scores": scores}, tmp_path / GRAPH, ["best", "values"], "", "")
+    best, values = _run_graph(_start_runner(tmp_path / GRAPH), {"scores": scores})
+    assert best.tolist()[::3] == best_items(scores[::3], 9).tolist()
     expected = scores[0].log_softmax(-1).topk(9)
-    assert torch.equal(items[0], expected.indices)
-    torch.testing.assert_close(values[0], expected.values)
-    assert items[1].tolist() == [-1] * 9
-    assert sorted(items[2].tolist()) == [-1] * 4 + [0, 1, 2, 3, 4]
+    torch.testing.assert_close(torch.from_numpy(values[0]), expected.values)
+    assert best[1].tolist() == [-1] * 9
+    assert sorted(best[2].tolist()) == [-1] * 4 + [0, 1, 2, 3, 4]
 
 
 # onnxruntime answers a request that comes alone as torch does.

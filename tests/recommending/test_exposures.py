@@ -10,6 +10,7 @@ import pytest
 from tests.support.killed import kills
 from tests.support.served import histories, requests_of, responder, with_rule
 from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Request
 from ucfrec.recommending.responder import Answer
@@ -71,6 +72,13 @@ def test_a_folder_that_cannot_be_written_loses_nothing_once_it_can(
         folder.mkdir()
     assert sorted(read(folder)) == sorted(rows_of(given))
     assert "cannot be written" in capsys.readouterr().err
+    log = ExposureLog(tmp_path / "gone", trained, seconds=0.05)
+    (tmp_path / "gone").rmdir()
+    (tmp_path / "gone").write_text("in the way")
+    for user, answer in given.items():
+        log.add(user, answer)
+    with pytest.raises(InputError, match=f"gone: {len(rows_of(given))} rows of exposures are lost"):
+        log.close()
 
 
 def test_recommend_writes_the_exposures_of_its_recommendations(

@@ -202,6 +202,19 @@ def test_the_command_recommends_candidates_only(
     assert "leave --candidates out" in capsys.readouterr().err
 
 
+def test_files_of_items_may_have_the_column_of_the_log(log: pd.DataFrame, tmp_path: Path) -> None:
+    file, run, out = (str(tmp_path / name) for name in ("log.parquet", "run", "out"))
+    log.rename(columns={"item_id": "video id"}).to_parquet(file)
+    Recommender("popular").fit(file, run, mapping={"item_id": '"video id"'}, reward="reward")
+    items = str(
+        write(pd.DataFrame({"video id": [4, 8], "name": ["four", "eight"]}), tmp_path / "a.csv")
+    )
+    assert main(["recommend", run, file, "--out", out, "--candidates", items, "--keep-seen"]) == 0
+    assert {*pd.read_parquet(out).item_id} == {4, 8}
+    assert main(["report", run, "--out", out, "--items", items]) == 0
+    assert "name four" in Path(out).read_text()
+
+
 def test_unknown_items_are_refused_or_skipped(policy: Recommender, log: pd.DataFrame) -> None:
     strange = pd.concat([log, log.tail(9).assign(item_id=999, timestamp=log.timestamp.max() + 1)])
     with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 item: 999\)"):

@@ -279,29 +279,33 @@ def test_a_promoted_run_answers_between_two_batches(folder: Path) -> None:
     assert {old} in rules
 
 
+@pytest.mark.parametrize("file", ["policy/best.safetensors", "run.json"])
 def test_a_run_that_cannot_be_used_changes_nothing(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str], file: str
 ) -> None:
-    shutil.copytree(folder / "run", folder / "broken")
+    broken = shutil.copytree(folder / "run", folder / "broken", dirs_exist_ok=True)
     with closing(Served(make, folder, None)) as served:
-        promote(folder / "broken", force=True)
-        weights = folder / "broken" / "policy" / "best.safetensors"
-        content = weights.read_bytes()
-        weights.unlink()
+        promote(broken, force=True)
+        content = (broken / file).read_bytes()
+        (broken / file).unlink()
+        if file == "run.json":  # another run under the name
+            RunRecord.read(folder / "run").copy_with(fingerprint="another store").write(broken)
         served.check()
         described = served.described()
         assert described["name"] == "run"
         assert described["refused"]["name"] == "broken"
         answers_of(served)
-        weights.write_bytes(content)
+        (broken / file).write_bytes(content)
         served.check()
         assert served.described()["name"] == "run"
-        promote(folder / "broken")
+        promote(broken)
         served.check()
         assert served.described()["name"] == "broken"
         promote_back(folder)
         served.check()
-    assert "broken is not used" in capsys.readouterr().err
+    why = "is not the run that was promoted" if file == "run.json" else "best.safetensors"
+    assert f"broken is not used: {broken}" in (said := capsys.readouterr().err)
+    assert why in said
 
 
 @pytest.mark.parametrize("damage", ["{", '{"files": {}, "current": "../other"}', "folder"])
@@ -342,6 +346,8 @@ def test_a_run_made_again_under_its_name_replaces_the_one_that_answers(folder: P
         try:
             served.check()
             assert served.trained.fingerprint == before
+            with pytest.raises(InputError, match="run is not the run that was promoted: promoted"):
+                Served(make, folder, None)
             promote(folder / "run", force=True)
             served.check()
             assert served.described()["run"] != before

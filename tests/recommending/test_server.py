@@ -6,9 +6,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from tests.support import light_workers
 from tests.test_processes import ended
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.recommending.server import Workers, listening_socket
+from ucfrec.recommending.server import Server, Workers, listening_socket, server_config
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 httpx = pytest.importorskip("httpx")
@@ -28,6 +29,7 @@ pytest.importorskip("fastapi_offline")
 
 
 Process = subprocess.Popen[str]
+looks_into_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
 
 
 @contextmanager
@@ -50,7 +52,7 @@ def served(run: Path, *options: str) -> Iterator[tuple[Process, str]]:
         yield process, ready.split("ready at ")[1].split()[0]
 
 
-def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
+def test_two_runs_share_the_users_and_hup_writes_the_exposures_of_every_answer(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:
     for name in ("a", "b"):
@@ -63,7 +65,7 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
             for user in range(20)
         ]
         assert not list(folder.iterdir())
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGHUP)  # as a terminal that is closed
         _, errors = process.communicate(timeout=60)
         assert (process.returncode, errors) == (0, "ucfrec serve: stopped\n")
     assert {answer["arm"] for answer in answers} == {"a", "b"}
@@ -77,6 +79,14 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
         )
     ]
     assert sorted(shown[names].itertuples(index=False, name=None)) == sorted(expected)
+
+
+def wait_for(what: Any, seconds: float = 60) -> None:
+    """Return once a function returns something true."""
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until
+        time.sleep(0.05)
 
 
 def connected(address: str, timeout: float) -> socket.socket:
@@ -164,6 +174,9 @@ def test_pipelined_requests_take_no_memory_and_term_is_obeyed(trained: TrainedPo
     [
         *(("allowed-hosts", given, "is not a host") for given in ("a*", "http://a", "", "a:80")),
         *(("workers", n, f"{n}; give a number from 1 to 256\n") for n in ("0", "10000")),
+        pytest.param(
+            "exposures", "/proc/self", "/proc/self cannot be written", marks=looks_into_proc
+        ),
     ],
 )
 def test_options_that_say_nothing_are_refused(
@@ -192,9 +205,70 @@ def test_a_damaged_run_and_a_taken_port_are_refused(
     assert "is not a run folder" in capsys.readouterr().err
 
 
-# Several processes on one address: they are replaced, ended in order, and outlive no parent.
+# Connections that ask nothing, or take no answer, end; others are not too many.
 
-looks_into_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
+TAKEN = 0.4
+"""Seconds that a client may take."""
+
+
+async def sizes(scope: Any, receive: Any, send: Any) -> None:
+    """Answers so many bytes as the path says, once the whole request is there."""
+    while (await receive()).get("more_body"):
+        pass
+    await send({"type": "http.response.start", "status": 200})
+    await send({"type": "http.response.body", "body": b"a" * int(scope["path"][1:])})
+
+
+@pytest.fixture
+def small() -> Iterator[tuple[Server, int]]:
+    """A server of at most five connections, three of each address, and its port."""
+    ready = threading.Event()
+    server = Server(server_config(sizes, TAKEN, 5, 3, lifespan="off"), lambda _: ready.set())
+    with listening_socket("127.0.0.1", 0) as listening:
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        assert ready.wait(20)
+        yield server, listening.getsockname()[1]
+        server.should_exit = server.force_exit = True
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        head()[:-4],
+        head(what=b"GET /3") + head()[:-4],
+        head(b"Content-Length: 9", what=b"POST /3") + b"abc",
+        head(what=b"GET /100000000"),
+    ],
+)
+def test_clients_that_take_too_long_are_cut_off(small: tuple[Server, int], sent: bytes) -> None:
+    server, port = small
+    began = time.monotonic()
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(sent)
+        wait_for(lambda: server.server_state.connections, 5)
+        wait_for(lambda: not server.server_state.connections, 5)
+        assert TAKEN <= time.monotonic() - began < 5 * TAKEN
+
+
+def test_connections_of_an_address_and_in_all_are_limited(small: tuple[Server, int]) -> None:
+    _, port = small
+    with ExitStack() as stack:
+        clients = [
+            stack.enter_context(
+                socket.create_connection(("127.0.0.1", port), 9, (f"127.0.0.{number}", 0))
+            )
+            for number in (1, 1, 1, 1, 2, 2, 2)
+        ]
+        answers = [client.recv(12) for client in clients]
+    refused = b"HTTP/1.1 503"
+    assert answers == [b"", b"", b"", refused, b"", b"", refused]
+    assert b"aaa" in answers_of(f"http://127.0.0.1:{port}", head(CLOSE, what=b"GET /3"))
+
+
+# Several processes on one address: they are replaced, ended in order, and outlive no parent.
 
 
 def workers_of(parent: int) -> set[int]:
@@ -217,14 +291,6 @@ def answered_by(port: int) -> int:
     """Which process answers."""
     with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
         return int(client.recv(100))
-
-
-def wait_for(what: Any, seconds: float = 60) -> None:
-    """Return once a function returns something true."""
-    until = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < until
-        time.sleep(0.05)
 
 
 @looks_into_proc

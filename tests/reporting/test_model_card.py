@@ -26,6 +26,7 @@ RECORD: dict[str, Any] = {
         "files": ["/home/me/secret/log.parquet"], "users": 33,
         "time_range_ms": [1_574_553_600_000, 1_575_158_400_000], "unknown_propensities": 7,
         "split_times_ms": [1_575_072_000_000, 1_575_115_200_000],
+        "feature_tables": {"item_id": {"items.csv": {"numbers": 2, "tags": 1}, "b.csv": {}}},
     },
 }  # fmt: skip
 
@@ -48,6 +49,7 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
     card = text_of(folder)
     for what in (
         "# Model card: dt", "2019-11-24 00:00 to 2019-11-30 00:00", "| reward | `is_click` |",
+        "| item_id features in items.csv | 2 numbers, 1 tags |", "in b.csv | no columns |",
         "| training steps | 5,400 |", "Its decision rule: target 9, argmax.",
         "It knows 80 items and never shows another one.", "7 steps of its logs have no propensity",
         "Nothing yet: `ucfrec evaluate`",
@@ -97,3 +99,7 @@ def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
     assert len(json.loads((folder / MEASURED).read_text())) == 2
     write_card(folder)  # training on keeps what was measured
     assert text_of(folder) == card
+    for damaged in ("[3]", "7", '[{"how": "x", "of": "y", "values": [1], "said": []}]'):
+        (folder / MEASURED).write_text(damaged)
+        with pytest.raises(InputError, match=r"measured\.json is damaged"):
+            write_card(folder)

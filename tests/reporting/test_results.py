@@ -54,14 +54,11 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
         earned("random", 1.0), earned("optimal", 9.0), earned("logging", 2.95),
         earned("dt", 2.0, training_seed=0), earned("ucf", 3.0, training_seed=0),
     )  # fmt: skip
-    assert "ucf has the highest return of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
-    assert "lies above those of the others, the next being dt (2)" in said
-    assert "higher than that of random (1), and lower than that of optimal (9)" in said
-    assert "Whether it is higher or lower than that of logging (2.95) is open" in said
-    assert "Each policy was trained once" in said
+    assert "ucf (3) has the highest return per episode of 2 trained (95%" in said
+    assert "(95% intervals 2.9 to 3.1; trainings: 1). Lower: dt (2), random (1)." in said
+    assert "Higher: optimal (9). Open, as intervals overlap: logging (2.95). It was tr" in said
     said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
-    assert "overlaps that of dt (2.9): which of them has the higher return is open" in said
-    assert "to compare it with" in said
+    assert "Open, as intervals overlap: dt (2.9). No built-in policy" in said
     said = of_environment(earned("random", 1.0))
     assert said == "In a, only built-in policies were evaluated: random (1)."
     assert conclude({}, ()) == [NO_RESULTS]
@@ -70,15 +67,14 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
 def test_seeds_of_training_are_taken_together() -> None:
     rows = [earned("ucf", value, training_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
     said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
-    assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
-    assert "higher than that of bad (1)" in said
-    assert "lower than that of random (3.5) is open" in said
+    assert "(95% intervals 2.9 to 5.1; trainings: 3). Open, as intervals overlap: random" in said
+    assert "Lower: bad (1)." in said
     assert "trained once" not in said
     # Checkpoints of one run are no seeds.
     best, last = (earned("ucf", value, training_seed=0, checkpoint=name)
                   for name, value in (("best", 3.0), ("last", 2.0)))  # fmt: skip
     said = of_environment(best, last)
-    assert "ucf, checkpoint best has the highest return of 2 trained policies: 3 (" in said
+    assert "ucf, checkpoint best (3) has the highest return" in said
     assert "trained once" in said
 
 

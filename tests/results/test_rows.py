@@ -12,11 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.result_rows import read_configurations, result_row
+from tests.support.result_rows import result_row
 from ucfrec.errors import InputError
-from ucfrec.provenance import config_hash
 from ucfrec.results.rows import (
-    CONFIGURATIONS,
     ResultRow,
     ResultTable,
     RowKey,
@@ -114,17 +112,8 @@ def test_a_key_covers_its_rows_and_no_others() -> None:
     assert not key.covers(replace(WHOLE, conditions={}))
 
 
-def test_configurations_lie_once_beside_the_rows(tmp_path: Path) -> None:
-    config = {"policy": {"dim": 8}, "seed": 0}
-    named = config_hash(config)
-    for seed in range(2):
-        append_rows(tmp_path / "a.jsonl", [result_row(config_hash=named)], config)
-        append_rows(tmp_path / "b.jsonl", [result_row(training_seed=seed)])
-    assert read_configurations(tmp_path) == {named: config}
-    assert len((tmp_path / CONFIGURATIONS).read_text().splitlines()) == 1
-    with pytest.raises(InputError, match="have the hash of another configuration"):
-        append_rows(tmp_path / "a.jsonl", [result_row(config_hash="other")], config)
-    with pytest.raises(InputError, match="is not a result row"):
+def test_of_rows_that_are_not_finite_none_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
         append_rows(tmp_path / "c.jsonl", [result_row(), result_row(float("nan"))])
     assert not (tmp_path / "c.jsonl").exists()
 

@@ -59,7 +59,7 @@ def test_a_first_run_needs_no_verdict_and_later_ones_do(
 
 
 def test_another_run_under_the_name_of_the_current_one_needs_a_verdict(
-    trained: TrainedPolicy, tmp_path: Path
+    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = runs(trained, tmp_path, "a", "b")
     promote(folder / "a")
@@ -69,6 +69,11 @@ def test_another_run_under_the_name_of_the_current_one_needs_a_verdict(
     for name in ("a", "b"):
         with pytest.raises(InputError, match="was compared with a, not with the current run a"):
             promote(updated(folder / name, trained, "better"))
+    told = "a is not the run that was promoted"
+    with pytest.raises(InputError, match=told):
+        promote(updated(folder / "b", TrainedPolicy.load(folder / "a"), "better"))
+    assert main(["update", str(folder), "log.parquet", "--out", str(tmp_path / "c")]) == 2
+    assert told in capsys.readouterr().err
     found = promote(folder / "a", force=True)
     assert found.fingerprint == TrainedPolicy.load(folder / "a").fingerprint
     assert found.previous == ()

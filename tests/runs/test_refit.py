@@ -58,6 +58,10 @@ def test_the_test_split_is_ranked_by_the_weights_before(
     assert "seen in training" not in capsys.readouterr().out
     assert main(["rank", str(run), str(folder / "log.parquet")]) == 0
     assert "100% of the rows were seen in training" in capsys.readouterr().out
+    # All weights of a refit are those of its end.
+    assert main(["rank", str(run), str(folder / "log.parquet"), "--checkpoint", "last"]) == 2
+    assert "of which there is one checkpoint; leave it out" in capsys.readouterr().err
+    assert main(["rank", str(run), "--checkpoint", "last"]) == 0
 
 
 def test_a_refit_is_made_once_and_again_for_other_weights(folder: Path, tmp_path: Path) -> None:

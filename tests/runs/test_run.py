@@ -20,7 +20,7 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import read_json
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.run import OWN, SharedStages, train_run
+from ucfrec.runs.run import share_stage, train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SHORT = [*killed_run.SETTINGS, "train.steps=4", "crm.epochs=1"]
@@ -200,7 +200,7 @@ SETTINGS = [
 
 
 def trained(
-    store: EpisodeStore, run: Path, shared: SharedStages, *settings: str, policy: str = "ucf"
+    store: EpisodeStore, run: Path, shared: Path | None, *settings: str, policy: str = "ucf"
 ) -> Path:
     config = resolve_config(policy, None, [*SETTINGS, *settings], seed=1)
     train_run(store, run, config, shared=shared)
@@ -213,10 +213,10 @@ def item_store(tmp_path: Path) -> EpisodeStore:
 
 
 def test_runs_are_what_they_would_be_alone(item_store: EpisodeStore, tmp_path: Path) -> None:
-    shared = SharedStages(tmp_path / "stages")
+    shared = tmp_path / "stages"
     first = trained(item_store, tmp_path / "first", shared)
     second = trained(item_store, tmp_path / "second", shared, "policy.lambda_mask=0.1")
-    alone = trained(item_store, tmp_path / "alone", OWN, "policy.lambda_mask=0.1")
+    alone = trained(item_store, tmp_path / "alone", None, "policy.lambda_mask=0.1")
     assert len([*(tmp_path / "stages").iterdir()]) == 2  # copies, and the reward model of items
     names = ("augmented", "crm/cvae/last", "reward_model/item_reward", "policy/best")
     assert_same_tensors(second, alone, *names)
@@ -240,11 +240,11 @@ def test_runs_are_what_they_would_be_alone(item_store: EpisodeStore, tmp_path: P
 def test_what_differs_is_made_anew(
     item_store: EpisodeStore, tmp_path: Path, settings: tuple[str, ...], policy: str, more: int
 ) -> None:
-    shared = SharedStages(tmp_path / "stages")
+    shared = tmp_path / "stages"
     trained(item_store, tmp_path / "first", shared)
     run = trained(item_store, tmp_path / "second", shared, *settings, policy=policy)
     assert len([*(tmp_path / "stages").iterdir()]) == 2 + more
-    alone = trained(item_store, tmp_path / "alone", OWN, *settings, policy=policy)
+    alone = trained(item_store, tmp_path / "alone", None, *settings, policy=policy)
     names = [n for n in ("augmented", "policy/best") if (alone / f"{n}.safetensors").exists()]
     assert_same_tensors(run, alone, *names)
 
@@ -252,7 +252,7 @@ def test_what_differs_is_made_anew(
 def test_what_was_interrupted_is_not_shared_and_not_taken_for_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shared, made = SharedStages(tmp_path / "stages"), []
+    shared, made = tmp_path / "stages", []
     first, second = tmp_path / "first", tmp_path / "second"
 
     def make(report: str) -> None:
@@ -264,7 +264,8 @@ def test_what_was_interrupted_is_not_shared_and_not_taken_for_finished(
         (first / "report").write_text(report)
 
     def provide(out: Path, report: str) -> None:
-        shared.provide({"seed": 0}, __name__, out, ("models", "report"), lambda: make(report))
+        names = ("models", "report")
+        share_stage(shared, {"seed": 0}, __name__, out, names, lambda: make(report))
 
     def killed(source: Path, to: Path) -> None:
         Path(to).write_text("the wh")

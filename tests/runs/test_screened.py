@@ -19,7 +19,6 @@ from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.refit import refit
-from ucfrec.runs.run import SharedStages
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -96,7 +95,7 @@ def test_runs_that_share_stages_are_screened_once(
 
     monkeypatch.setattr(screened, "screen_store", screen)
     stores = [planted_items(tmp_path / str(n), n, 8) for n in (30, 31)]
-    shared, found = SharedStages(tmp_path / "stages"), []
+    shared, found = tmp_path / "stages", []
     for store, how, seed in product(stores, ("copies", "drop"), (0, 1)):
         config = resolve_config("bc", None, SETTINGS, seed)
         out = tmp_path / f"{store.path.name}-{how}-{seed}"

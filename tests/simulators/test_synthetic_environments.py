@@ -143,47 +143,20 @@ def test_boredom_against_a_plain_reading_of_the_rule() -> None:
     assert min(bored_ends, capped_ends) > 20
 
 
-def test_clicks_have_the_stated_probability_and_moods_are_not_told() -> None:
-    moody, calm = (SyntheticCatalog(6000, n_users=3, mood=mood) for mood in (1.5, 0.0))
-    told = [env.reset(seed=0) for env in (moody, calm)]
-    assert told[0][0].shape == told[1][0].shape
-    assert told[0][1].keys() == told[1][1].keys()
-    assert abs(moody.good_mood.mean() - 0.5) < 4 * np.sqrt(0.25 / 6000)
-    assert not calm.good_mood.any()
-    for env, moods in ((moody, [-1.5, 1.5]), (calm, [0.0])):
-        users, good = env.users.copy(), env.good_mood.copy()
-        _, clicks, *_ = env.step(np.full(6000, 17))
-        for user in range(3):
-            chances = 1 / (1 + np.exp(-(env.logits[user, 17] + np.array(moods))))
-            assert env.click_probabilities[user, 17] == pytest.approx(chances.mean())
-            for mood, chance in enumerate(chances):
-                group = clicks[(users == user) & (good == mood)]
-                assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
-
-
-def even_tags_and_clicks(mood: float, behavior: str) -> np.ndarray:
-    """Click rates of odd and of even tags in a log, each relative to what causes clicks."""
-    catalogue = synthetic_catalog.simulator(mood)
-    env = catalogue.make(256, None)
-    _, steps = play(env, catalogue.behaviors[behavior](env, 0), 3000, 0)
-    items = steps["actions"]
-    luck = steps["rewards"] - env.click_probabilities[steps["user_ids"], items]
-    return np.array([luck[env.tags[items] % 2 == odd].mean() for odd in (1, 0)])
-
-
-def test_moods_confound_what_was_shown_with_what_was_clicked() -> None:
-    odd, even = even_tags_and_clicks(1.5, "mixture")
-    assert even - odd > 0.05
-    for mood, behavior in ((0.0, "mixture"), (1.5, "random")):
-        odd, even = even_tags_and_clicks(mood, behavior)
-        assert abs(even - odd) < 0.03
-
-
-@pytest.mark.parametrize("mood", [0.0, 1.5])
-def test_propensities_are_exact(mood: float) -> None:
-    env = SyntheticCatalog(20_000, n_items=24, n_users=1, mood=mood)
+def test_clicks_have_the_stated_probability() -> None:
+    env = SyntheticCatalog(6000, n_users=3)
     env.reset(seed=0)
-    env.good_mood[:] = int(mood > 0)  # all alike, so that the shares below are of one mood
+    users = env.users.copy()
+    _, clicks, *_ = env.step(np.full(6000, 17))
+    for user in range(3):
+        chance = 1 / (1 + np.exp(-env.logits[user, 17]))
+        group = clicks[users == user]
+        assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
+
+
+def test_propensities_are_exact() -> None:
+    env = SyntheticCatalog(20_000, n_items=24, n_users=1)
+    env.reset(seed=0)
     guess = SoftmaxGuess(env, 0, error=1.0, temperature=0.7, epsilon=0.2, variety=2.0)
     probabilities = guess.probabilities()
     np.testing.assert_allclose(probabilities.sum(axis=1), 1.0)
@@ -218,7 +191,6 @@ def test_catalog_behaviors_are_ordered_and_items_described() -> None:
     ("use", "says"),
     [
         (lambda: SyntheticCatalog(1, n_tags=3), "boredom_window"),
-        (lambda: SyntheticCatalog(1, mood=-1.0), "mood is -1"),
         (lambda: CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0), "not SyntheticTaobao"),
         (lambda: stepped(SyntheticCatalog(2), [0, 200]), "from 0 to 199"),
         (lambda: stepped(SyntheticCatalog(2), [-1, 0]), "from 0 to 199"),

@@ -6,7 +6,7 @@ from ucfrec_simulators.kuai.environment import ExitRule
 
 
 class Plain:
-    """One session as the published code simulates it, its slices included."""
+    """One session by the published rule."""
 
     def __init__(self, tags: list[tuple[int, ...]], rule: ExitRule) -> None:
         self.tags, self.rule, self.shown = tags, rule, list[int]()
@@ -14,7 +14,7 @@ class Plain:
     def step(self, item: int) -> tuple[bool, bool]:
         """Whether the user leaves by the rule, and whether the session is over."""
         t, rule = len(self.shown), self.rule
-        first = t - rule.window if rule.sliced else max(0, t - rule.window)
+        first = max(0, t - rule.window)
         pooled = Counter(tag for shown in self.shown[first:t] for tag in self._of(shown))
         self.shown.append(item)
         bored = t > 0 and any(pooled[tag] > rule.threshold for tag in self._of(item))

@@ -20,10 +20,10 @@ class Ends:
 def answer(listening: socket.socket, parent: Parent) -> None:
     """Send each client the number of this process; at the end, take a second or be forced."""
     ends = Ends()
-    parent.ends(ends)
+    parent.ends(ends)  # type: ignore[arg-type]
     listening.listen()
     listening.settimeout(0.05)
-    parent.ready("light workers")
+    parent.report("ready", "light workers")
     while not ends.should_exit:
         with suppress(TimeoutError), listening.accept()[0] as client:
             client.sendall(str(os.getpid()).encode())
@@ -36,7 +36,7 @@ def answer(listening: socket.socket, parent: Parent) -> None:
 
 def refuse(listening: socket.socket, parent: Parent) -> None:
     """Cannot start."""
-    parent.failed("no model")
+    parent.report("failed", "no model")
 
 
 def refuse_later(listening: socket.socket, parent: Parent) -> None:
@@ -45,7 +45,7 @@ def refuse_later(listening: socket.socket, parent: Parent) -> None:
         with suppress(FileExistsError):
             Path(os.environ["LIGHT_WORKERS"], name).touch(exist_ok=False)
             return answer(listening, parent)
-    parent.failed("no model")
+    parent.report("failed", "no model")
 
 
 def main() -> None:

@@ -22,6 +22,9 @@ SOURCE: dict[str, Any] = {
     "unsorted_rows": 4,
     "steps": 1179,
     "items": 9,
+    **{"reward": "r", "session_by": "gap", "reward_statistics": {"mean": 0.5}},
+    **{"splits": {}, "files": ["log.csv"], "users": 90, "sessions": 8, "sessions_cut": 0},
+    **{"conflicting_duplicates": 6, "equal_times": 0, "time_range_ms": [0, 86_400_000]},
     "summary": {
         "session_lengths": {"edges": [1, 2, 4, 8], "counts": [4, 3, 1], "quantiles": QUANTILES},
         "rewards": {"values": [0.0, 1.0], "counts": [900, 279], "quantiles": QUANTILES},

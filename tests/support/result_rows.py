@@ -1,11 +1,9 @@
 """Result rows written out."""
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from ucfrec.results.rows import CONFIGURATIONS, ResultRow
+from ucfrec.results.rows import ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
@@ -16,12 +14,6 @@ def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
     given |= {"training_seed": 0, "checkpoint": "best"} | fields
     given["metrics"] = {given["metric"]: value, **fields.get("metrics", {})}
     return ResultRow(**given)
-
-
-def read_configurations(folder: Path) -> dict[str, Any]:
-    """The configurations of the rows in `folder`, by hash."""
-    lines = map(json.loads, (folder / CONFIGURATIONS).read_text().splitlines())
-    return {line["hash"]: line["config"] for line in lines}
 
 
 def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:

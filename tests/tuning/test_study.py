@@ -43,6 +43,11 @@ def plan(store: Path, out: Path, policies: tuple[str, ...] = ("dt",), metric: st
     return Plan(store, out, Search(policies, FIXED, metric == "value", 0, SPACE), metric, k=5)
 
 
+def alter(searched: Plan, statement: str) -> None:
+    with sqlite3.connect(searched.out / "study.db") as study:
+        study.execute(statement)
+
+
 def values(study: optuna.Study) -> list[tuple[float | None, Mapping[str, object]]]:
     return [(trial.value, trial.params) for trial in list_finished(study)]
 
@@ -89,18 +94,23 @@ def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
     assert (tmp_path / "tuned" / BEST / RunRecord.FILE).exists()
 
 
-def test_a_killed_trial_is_run_again(store: Path, tmp_path: Path) -> None:
-    searched = plan(store, tmp_path / "tuned")
+def test_a_killed_trial_is_run_again_in_a_folder_of_any_name(store: Path, tmp_path: Path) -> None:
+    searched = plan(store, tmp_path / "a%2F{b}?c#[1]")
     tune(searched, 1)
-    with sqlite3.connect(
-        searched.out / "study.db"
-    ) as study:  # as a process that was killed leaves it
-        study.execute("UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
-        study.execute("DELETE FROM trial_values")
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [searched.out.name]
+    # As a process that was killed leaves it.
+    alter(searched, "UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
+    alter(searched, "DELETE FROM trial_values")
     resumed = tune(searched, 1)
     states = [trial.state.name for trial in resumed.trials]
     assert states == ["FAIL", "COMPLETE"]
     assert resumed.trials[0].params == resumed.trials[1].params
+    alter(searched, "UPDATE trials SET state = 'LOST'")
+    with pytest.raises(InputError, match=r"study\.db is damaged \(LookupError: 'LOST' is not"):
+        tune(searched, 1)
+    (searched.out / "study.db").write_bytes(bytes(5000))
+    with pytest.raises(InputError, match=r"study\.db cannot be read .*file is not a database"):
+        tune(searched, 1)
 
 
 def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:

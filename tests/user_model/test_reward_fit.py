@@ -17,7 +17,12 @@ from ucfrec.errors import InputError
 from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import fit_effects
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
-from ucfrec.user_model.reward_report import RewardRows, UserCalibration
+from ucfrec.user_model.reward_report import (
+    RewardRows,
+    UserCalibration,
+    calibration_error,
+    score_rows,
+)
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
 
@@ -92,10 +97,9 @@ def test_planted_item_effects_are_recovered_and_calibrated(tmp_path: Path) -> No
     assert 0.8 < slope < 1.2
     assert {"item", "user"} <= report.kept.keys()
     assert report.loss < report.item_loss + 1e-9 < report.base_loss
-    assert report.calibration.error < 0.05
-    assert sum(report.calibration.count) == report.validation_rows == 99 * LENGTH
-    assert abs(report.gauc - report.item_rate_gauc) < 3 * report.gauc_gain_error + 0.01
-    assert report.gauc > 0.6
+    rows = RewardRows.of(store_of(planted, clicks(planted)).split("validation"), 10, 10**6, 0)
+    predicted = model.expect(score_rows(model, rows)).double().numpy()
+    assert calibration_error(predicted, rows.rewards.double().numpy()) < 0.05
 
 
 def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
@@ -104,7 +108,7 @@ def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
     assert "exposure" in report.kept
     assert model.exposure[1, 0] < -1
     assert model.exposure[1, 1:].abs().max() < 0.5
-    assert report.gauc_gain > 2 * report.gauc_gain_error
+    assert report.loss < report.item_loss
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -177,7 +181,7 @@ def test_a_search_begins_and_ends_near_an_earlier_one(
     assert warm.loss < 1.01 * cold.loss
     assert {"item", "user"} <= old.kept.keys() & warm.kept.keys()
     none = fit_item_reward_model(*views(store), tmp_path / "none", 0, first=tmp_path / "nowhere")[1]
-    assert replace(none, seconds=0) == replace(cold, seconds=0)
+    assert none == cold
 
 
 def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> None:
@@ -185,13 +189,12 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
     noise = np.random.default_rng(0).normal(0, 1, len(planted.items))
     rewards = 50 + 7 * (planted.predictor + noise)
     store = store_of(planted, rewards)
-    model, report = fit_item_reward_model(*views(store), tmp_path, seed=0)
-    assert not report.binary
+    model, _ = fit_item_reward_model(*views(store), tmp_path, seed=0)
+    assert not model.binary
     rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
     scores = model.score(rows.states, rows.history, rows.users, rows.items)
     errors = (model.expect(scores) - rows.rewards).numpy()
-    assert 1 - errors.var() / rows.rewards.numpy().var() == pytest.approx(report.r2, abs=0.02)
-    assert report.r2 > 0.25
+    assert 1 - errors.var() / rows.rewards.numpy().var() > 0.25
     slope = np.polyfit(planted.of_item, model.item.numpy() * float(model.reward_std), 1)[0]
     assert slope == pytest.approx(7, rel=0.15)
 
@@ -240,7 +243,6 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path, monkeypatch: pytest.Mon
     first, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
     again, _ = fit_item_reward_model(*views(store), tmp_path / "b", seed=0)
     kept, kept_report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
-    assert report.train_rows == 600
     assert kept_report == report
     for name, value in first.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name

@@ -95,8 +95,6 @@ def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> 
     users = fit_training_users(log_of_moods(0.7), tmp_path / "weighted", seed=0)
     crude = fit_training_users(log_of_moods(0.7, told=False), tmp_path / "crude", seed=0)
     assert (users.report.weighted, crude.report.weighted) == (True, False)
-    assert users.report.effective_steps < users.report.steps == USERS * LENGTH
-    assert crude.report.effective_steps == crude.report.steps
     found, without = chances(users, rows), chances(crude, rows)
     assert without[first].mean() - without[~first].mean() > 0.3
     assert abs(found[first].mean() - found[~first].mean()) < 0.1

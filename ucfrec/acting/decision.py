@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Final, Self
 
+import numpy as np
 import torch
 from pydantic import Field, PlainSerializer, PlainValidator
 from torch import Tensor
@@ -231,11 +232,11 @@ SavedRule = Annotated[
 
 
 def _only_best(scores: Tensor, count: int | None) -> Tensor:
-    """The scores (B, n), −∞ below the `count` best."""
+    """The scores (B, n), −∞ but for the `count` best."""
     if count is None or count >= scores.shape[1]:
         return scores
-    lowest = scores.topk(count, dim=-1).values[:, -1:]
-    return scores.masked_fill(scores < lowest, -torch.inf)
+    best = best_items(scores, count)
+    return torch.full_like(scores, -torch.inf).scatter(1, best, scores.gather(1, best))
 
 
 def _conditional(logs: Tensor, items: Tensor, follows: Tensor | None = None) -> Tensor:
@@ -272,23 +273,24 @@ def _next_best(by_score: Tensor, items: Tensor) -> Tensor:
 
 
 def best_items(scores: Tensor, k: int) -> Tensor:
-    """Numbers (B, k) of the k highest scores (B, n), best first; k at most n.
+    """Numbers (B, k) of the k highest scores (B, n), best first, and of equal scores the lowest
+    number first; k at most n.
 
     The k best of all lie in the k blocks of items with the highest maxima, so a pass that finds the
-    maxima is all that reads every score. Among equal scores any may be chosen, but a row's first is
-    `choose`'s, so that the best item is the same however many are shown.
+    maxima is all that reads every score. A row is read again where its k + 1 best are not distinct.
     """
+    if torch.compiler.is_exporting():  # ONNX's TopK puts the lowest number first
+        return scores.topk(k, dim=-1).indices
     if k == 1:
         return _best(scores).unsqueeze(1)
-    highest, numbers = _some_best(scores, k)
-    tied = highest[:, 0] == highest[:, 1]
-    if tied.any():
-        first = _best(scores[tied]).unsqueeze(1)
-        # The first comes in front, and excludes itself further back or else the last.
-        joined = torch.cat([first, numbers[tied]], dim=1)
-        again = (joined == first).index_fill(1, torch.tensor([0]), False)
-        numbers[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])
-    return numbers
+    values, numbers = _some_best(scores, min(k + 1, scores.shape[1]))
+    for row in (values[:, 1:] == values[:, :-1]).any(1).nonzero()[:, 0].tolist():
+        of_row, last = scores[row].numpy(), values[row, k - 1].item()
+        above = np.flatnonzero(of_row > last)
+        best = np.append(above, np.flatnonzero(of_row == last)[: k - len(above)])
+        best = best[np.argsort(-of_row[best], kind="stable")]
+        numbers[row, :k] = torch.from_numpy(best)
+    return numbers[:, :k]
 
 
 def _best(scores: Tensor) -> Tensor:
@@ -300,7 +302,7 @@ def _best(scores: Tensor) -> Tensor:
 
 
 def _some_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The highest scores (B, k) and their numbers; any of equal scores may be the first."""
+    """The highest scores (B, k) and their numbers; any of equal scores may come first."""
     n = scores.shape[1]
     # Both searches that follow the pass are of about the same size.
     size = max(_BLOCK, round((n / k) ** 0.5))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_table import WINDOW
@@ -371,7 +371,7 @@ class Scorer:
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
         rewards = model.expect(odds)
         scores = scores + weight * rewards
-        best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
+        best = best_items(scores, min(_LOOKED_AT, self._items.count))
         some, recent = rewards.gather(1, best), recent.latest(model.lags)
         if end.uses_rewards and self._outcomes is not None:
             outcomes = [torch.full_like(some, reward) for reward in self._outcomes]

@@ -1,1 +1,1 @@
-"""Benchmarks: cells of methods and tasks, their budgets, plan, workers, time, tables and plots."""
+"""Benchmarks: cells of methods and tasks, their budgets, plan, workers, time and tables."""

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.provenance import config_hash
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.run import OWN, SharedStages
 from ucfrec.runs.screened import SCREENING
 
 Presets = Mapping[str, Mapping[str, Any]]
@@ -44,7 +44,7 @@ class Method:
 
 
 def make_augmented_ucf(*settings: str, vectors: bool = True) -> Method:
-    """UCF with augmented states, as in the paper's tables, and more settings."""
+    """UCF with augmented states, and more settings."""
     return Method("ucf", ("augment.copies=1", *settings), vectors=vectors)
 
 
@@ -164,8 +164,8 @@ class Cell:
     """None for a built-in policy, as are `store` and `run`."""
     store: Path | None = None
     run: Path | None = None
-    shared: SharedStages = OWN
-    """Reward models and augmentation that methods have in common."""
+    shared: Path | None = None
+    """Folder of reward models and augmentation that methods have in common."""
     settings: tuple[str, ...] = ()
     presets: Presets = field(default_factory=dict)
     """Defaults of the training for its data, below `settings`."""
@@ -245,7 +245,7 @@ class Plan:
     ) -> Iterator[Cell]:
         """One cell for each training seed of each method that supports the actions of the task.
         Cells of equal trainings share a run."""
-        store = EpisodeStore.open(task.store)
+        store, make = EpisodeStore.open(task.store), self._fill(table, task)
         for name, method in methods.items():
             if not method.supports(store):
                 continue
@@ -260,19 +260,14 @@ class Plan:
             place = folder_name("-".join([task.name, *map(str, task.conditions.values())]))
             run = self.folder / "runs" / place / f"{folder_name(name)}-{digest}"
             for seed in range(self.budget.seeds_of(task.name, name)):
-                yield Cell(
-                    suite=self.suite,
-                    table=table,
-                    budget=self.budget.name,
-                    task=task.name,
+                yield make(
                     method=name,
-                    environments=task.environments,
                     evaluation=evaluation or self.budget.evaluation,
                     log_seed=task.log_seed,
                     training_seed=seed,
                     store=task.store,
                     run=run.with_name(f"{run.name}-{seed}"),
-                    shared=SharedStages(self.folder / "stages"),
+                    shared=self.folder / "stages",
                     conditioned=method.conditioned,
                     conditions={**task.conditions, **(conditions or {})},
                     **training,
@@ -284,16 +279,15 @@ class Plan:
         """One cell for each built-in policy of the task's environments, told apart from one of
         `methods` with its name."""
         for name in task.behaviors:
-            yield Cell(
-                suite=self.suite,
-                table=table,
-                budget=self.budget.name,
-                task=task.name,
-                method=f"{name} (simulator)" if name in methods else name,
-                policy=name,
-                environments=task.environments,
-                evaluation=self.budget.evaluation,
+            method = f"{name} (simulator)" if name in methods else name
+            yield self._fill(table, task)(
+                method=method, policy=name, evaluation=self.budget.evaluation
             )
+
+    def _fill(self, table: str, task: Task) -> partial[Cell]:
+        """What all cells of a task in a table have."""
+        names: dict[str, Any] = {"suite": self.suite, "table": table, "budget": self.budget.name}
+        return partial(Cell, **names, task=task.name, environments=task.environments)
 
 
 def folder_name(name: str) -> str:

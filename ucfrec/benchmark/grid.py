@@ -1,39 +1,18 @@
 """Run the measurements of a benchmark, here or in parallel processes, resumably."""
 
-import json
 import shutil
 import sys
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import as_completed
-from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from ucfrec.benchmark.cells import Cell, Measurement, make_key
 from ucfrec.errors import InputError
 from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes, progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.results.rows import ResultRow, RowKey, append_rows, read_rows, remove_rows
-
-
-@dataclass(frozen=True)
-class _Task:
-    """A cell to be measured."""
-
-    cell: Cell
-    key: RowKey
-    config: Mapping[str, Any] | None
-    how: Measurement
-    results: Path
-
-    def measure(self) -> list[ResultRow]:
-        """Measure the cell, append its rows and return them."""
-        reset_peak_memory()
-        rows, peak = self.how.measure(self.cell, self.key), peak_memory_mib()
-        rows = [replace(row, peak_memory_mib=peak) for row in rows]
-        append_rows(self.results, rows, self.config)
-        return rows
 
 
 def run_grid(
@@ -63,85 +42,86 @@ def run_grid(
     """
     if workers < 1:
         raise InputError(f"--workers is {workers}; at least one is needed")
-    tasks: dict[str, _Task] = {}
+    tasks: dict[str, tuple[RowKey, Cell]] = {}
     for cell in cells:
-        # Of JSON, as a file of configurations has it.
-        config = json.loads(json.dumps(how.config(cell)))
+        config = how.config(cell)
         key = replace(make_key(cell), config_hash=None if config is None else config_hash(config))
-        tasks.setdefault(str(key), _Task(cell, key, config, how, results))
+        tasks.setdefault(str(key), (key, cell))
     if again:
-        remove_rows(results, [task.key for task in tasks.values()])
-        for task in tasks.values():
-            for folder in (task.cell.run, task.cell.shared.folder):
+        remove_rows(results, [key for key, _ in tasks.values()])
+        for _, cell in tasks.values():
+            for folder in (cell.run, cell.shared):
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
     earlier = read_rows(results)
-    rows = {name: [row for row in earlier if t.key.covers(row)] for name, t in tasks.items()}
-    missing = {name: task for name, task in tasks.items() if not rows[name]}
-    counts = f"{len(tasks)} cells, {len(missing)} of them left to measure"
-    print(f"{describe}: {counts}", file=sys.stderr)
+    rows = {name: [r for r in earlier if key.covers(r)] for name, (key, _) in tasks.items()}
+    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
+    missing = sorted(
+        (name for name in tasks if not rows[name]),
+        key=lambda name: -1 if (seed := tasks[name][0].training_seed) is None else seed,
+    )
+    print(
+        f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
+    )
     if missing:
-        rows |= _measure_all(missing, workers, describe)
+        measure = partial(_measure, how.measure, results)
+        calls = {name: partial(measure, *tasks[name]) for name in missing}
+        rows |= _measure_all(calls, workers, describe)
     return [row for group in rows.values() for row in group]
 
 
-def _measure_all(
-    tasks: Mapping[str, _Task], workers: int, describe: str
-) -> dict[str, list[ResultRow]]:
-    """The rows of each task; raises an error at the end if one of them failed."""
-    errors, rows, workers = [], {}, min(workers, len(tasks))
-
-    def place(name: str) -> int:
-        seed = tasks[name].key.training_seed
-        return -1 if seed is None else seed
-
-    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
-    ordered = {name: tasks[name] for name in sorted(tasks, key=place)}
-    outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
-    with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
-        for name, outcome in outcomes:
-            if isinstance(outcome, BaseException):
-                errors.append(f"{tasks[name].key}: {type(outcome).__name__}: {outcome}")
-            else:
-                rows[name] = outcome
-            bar.update()
-    if errors:
-        raise InputError(
-            f"{len(errors)} of {len(tasks)} cells failed; run the command again to retry them. The "
-            f"first: {errors[0]}"
-        )
+def _measure(
+    measure: Callable[[Cell, RowKey], list[ResultRow]], results: Path, key: RowKey, cell: Cell
+) -> list[ResultRow]:
+    """Measure a cell, append its rows and return them."""
+    reset_peak_memory()
+    rows, peak = measure(cell, key), peak_memory_mib()
+    rows = [replace(row, peak_memory_mib=peak) for row in rows]
+    append_rows(results, rows)
     return rows
 
 
-_Outcomes = Generator[tuple[str, list[ResultRow] | BaseException], None, None]
-"""Name of a task, and its rows or why it has none."""
+_Call = Callable[[], list[ResultRow]]
 
 
-def _measure_in_processes(tasks: Mapping[str, _Task], workers: int) -> _Outcomes:
-    with pool_of_processes(workers, _use_one_thread) as pool:
-        with block_ctrl_c():
-            names = {pool.submit(task.measure): name for name, task in tasks.items()}
-        for done in as_completed(names):
-            yield names[done], done.exception() or done.result()
-
-
-def _measure_here(tasks: Mapping[str, _Task]) -> _Outcomes:
+def _measure_all(
+    calls: Mapping[str, _Call], workers: int, describe: str
+) -> dict[str, list[ResultRow]]:
+    """The rows of each key; raises an error at the end if the call for one failed."""
     import torch  # takes a second, and is not needed to print tables
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        for name, task in tasks.items():
+    errors, rows, workers = [], {}, min(workers, len(calls))
+
+    def collect(key: str, call: _Call) -> None:
+        try:
+            # What a library makes of an interruption is not a failure of the cell.
+            with interruptions_raised():
+                rows[key] = call()
+        except Exception as error:
+            errors.append(f"{key}: {type(error).__name__}: {error}")
+        bar.update()
+
+    with progress(len(calls), describe, "cells") as bar:
+        if workers > 1:
+            with pool_of_processes(workers, _use_one_thread) as pool:
+                with block_ctrl_c():
+                    keys = {pool.submit(call): key for key, call in calls.items()}
+                for done in as_completed(keys):
+                    collect(keys[done], done.result)
+        else:
+            threads = torch.get_num_threads()
+            _use_one_thread()
             try:
-                # What a library makes of an interruption is not a failure of the cell.
-                with interruptions_raised():
-                    rows = task.measure()
-            except Exception as error:
-                yield name, error
-            else:
-                yield name, rows
-    finally:
-        torch.set_num_threads(threads)
+                for key, call in calls.items():
+                    collect(key, call)
+            finally:
+                torch.set_num_threads(threads)
+    if errors:
+        raise InputError(
+            f"{len(errors)} of {len(calls)} cells failed; run the command again to retry them. The "
+            f"first: {errors[0]}"
+        )
+    return rows
 
 
 def _use_one_thread() -> None:

@@ -20,8 +20,6 @@ class Shown:
 
     title: str
     markdown: Callable[[Rows], str]
-    plot: Callable[[Rows, Path], list[Path]]
-    """Draws into a folder; returns the files."""
 
     def show(self, rows: Rows) -> str:
         """The table below its title, as Markdown."""
@@ -89,7 +87,7 @@ class BenchmarkRequest:
 
 
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
-    """The tables; measures their cells that have no row yet, and plots into `out/budget/plots`.
+    """The tables; measures their cells that have no row yet.
 
     Raises:
         InputError: the budget, a task or a method is unknown, another table than main is requested
@@ -109,7 +107,6 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         f"{name} is excluded: its files are not in the data folder, or its package is not installed"
         for name in plan.missing()
     ]
-    plots = request.out / request.budget / "plots"
     for table in tables:
         cells = [
             cell
@@ -118,8 +115,7 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         ]
         rows = run_grid(cells, suite.how, request.results, request.workers, table, request.again)
         parts.append(suite.tables[table].show(rows))
-        suite.tables[table].plot(rows, plots)
-    return "\n\n".join([*parts, f"pictures: {plots}"])
+    return "\n\n".join(parts)
 
 
 def show(suite: Benchmark, tables: Sequence[str], rows: Rows) -> str:

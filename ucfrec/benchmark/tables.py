@@ -1,21 +1,12 @@
-"""Tables and plots of result rows: means and spreads over logs and seeds, and differences to a
+"""Tables of result rows: means and spreads over logs and seeds, and differences to a
 method."""
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
-import numpy as np
-
-from ucfrec.reporting.charts import LIGHT, PLAIN, file_style, save
-from ucfrec.reporting.charts import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
@@ -25,9 +16,7 @@ OURS: Final = "ucf"
 MEAN: Final = "mean"
 NEAR: Final = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
-_Column = str | Callable[[Sequence[ResultRow]], str]
-"""A metric, whose mean and spread is shown, or what makes the text for the rows of a line."""
-_BySeed = dict[tuple[int | None, int | None], float]
+BySeed = Mapping[tuple[int | None, int | None], float]
 """Values by the seeds of the log and of the training."""
 
 
@@ -38,43 +27,41 @@ def method_table(rows: Sequence[ResultRow]) -> str:
     rule in the user model of the log. `− ucf` is the return less that of UCF of the same log and
     seed: mean ± standard error over the pairs, and in brackets over the means of logs.
     """
-    ours = [row for row in _select_checkpoint(rows) if row.method == OURS]
-    of_ours = grouped(ours, lambda row: row.environment)
-
-    def list_targets(group: Sequence[ResultRow]) -> str:
-        targets = {f"{row.target_return:g}" for row in group if row.target_return is not None}
-        return ", ".join(sorted(targets, key=float)) or NONE
-
-    def compare(group: Sequence[ResultRow]) -> str:
-        if group[0].method == OURS:
-            return NONE
-        ours = _index_by_seeds(of_ours.get(group[0].environment, ()))
-        return _format_difference(_subtract(_index_by_seeds(group), ours))
-
     names = ("R_cum", "R_avg_pooled", "R_avg_episode", "length", "coverage")
-    columns: dict[str, _Column] = {name: name for name in names}
-    columns |= {"target": list_targets, "estimate": "estimated_value", f"− {OURS}": compare}
-    return _make_table(rows, "method", columns)
+    groups, lines = _group_methods(rows), []
+    for (environment, method), group in groups.items():
+        targets = {row.target_return for row in group if row.target_return is not None}
+        ours = index_by_seeds(groups.get((environment, OURS), ()) if method != OURS else ())
+        lines.append(
+            (
+                *(environment, method, len(group), *_average(group, *names)),
+                ", ".join(f"{target:g}" for target in sorted(targets)) or NONE,
+                *_average(group, "estimated_value"),
+                _format_difference(subtract(index_by_seeds(group), ours)),
+            )
+        )
+    head = ("environment", "method", "logs × seeds", *names, "target", "estimate", f"− {OURS}")
+    return markdown_table(head, lines)
 
 
 def sweep_table(rows: Sequence[ResultRow]) -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
-    columns = {"R_cum": "R_cum", "validation loss": "validation_loss", "acceptance": "acceptance"}
-    return _make_table(rows, "setting", columns)
+    lines = [
+        (*case, len(group), *_average(group, "R_cum", "validation_loss", "acceptance"))
+        for case, group in _group_methods(rows).items()
+    ]
+    head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
+    return markdown_table(head, lines)
 
 
-def _make_table(rows: Sequence[ResultRow], name: str, columns: Mapping[str, _Column]) -> str:
-    def fill(group: Sequence[ResultRow], column: _Column) -> str:
-        if not isinstance(column, str):
-            return column(group)
-        return mean_and_sd(row.metrics[column] for row in group if column in row.metrics)
+def _group_methods(
+    rows: Sequence[ResultRow],
+) -> Mapping[tuple[str | None, str], Sequence[ResultRow]]:
+    return grouped(_select_checkpoint(rows), lambda row: (row.environment, row.method))
 
-    lines = []
-    groups = grouped(_select_checkpoint(rows), lambda row: (row.environment, row.method))
-    for (environment, method), group in groups.items():
-        cells = [fill(group, column) for column in columns.values()]
-        lines.append((environment, method, len(group), *cells))
-    return markdown_table(("environment", name, "logs × seeds", *columns), lines)
+
+def _average(rows: Sequence[ResultRow], *metrics: str) -> list[str]:
+    return [mean_and_sd(row.metrics[n] for row in rows if n in row.metrics) for n in metrics]
 
 
 def distractor_table(rows: Sequence[ResultRow]) -> str:
@@ -91,7 +78,7 @@ def distractor_table(rows: Sequence[ResultRow]) -> str:
     # Environments together, the largest target first; methods stay in their order.
     for (environment, quantile, method), group in sorted(groups.items(), key=lambda g: g[0][:2]):
         by_rate = grouped(group, lambda row: row.conditions["distractor"])
-        indexed = [_index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
+        indexed = [index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
         pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
         if not pairs:  # an environment in which no distractor was planted
             continue
@@ -118,33 +105,27 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         checkpoint: "last" or "best"; IQL and CQL keep only their last one, which is always shown.
     """
     rows = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
-    values, tasks = _group_by_seed(rows, "score"), list(dict.fromkeys(row.task for row in rows))
-    cells: dict[str, dict[str, Summary]] = {}
-    for method in dict.fromkeys(row.method for row in rows):
-        of_tasks = [values[method, task] for task in tasks]
-        scores = [summary(seeds.values()) for seeds in of_tasks]
-        scores.append(_summarise_tasks(of_tasks))
-        cells[method] = dict(zip((*tasks, MEAN), scores, strict=True))
-    best = {}
-    for name in (*tasks, MEAN):
-        means = [of[name].mean for of in cells.values() if of[name].count]
-        best[name] = max(means, default=0.0)
+    cells = {name: summarise_tasks(own) for name, own in values_by_task(rows, "score").items()}
+    columns = zip(*cells.values(), strict=True)
+    best = [max((own.mean for own in column if own.count), default=0.0) for column in columns]
     lines = []
-    for method, of_method in cells.items():
-        counts = [of_method[task].count for task in tasks]
+    for method, scores in cells.items():
+        counts = [own.count for own in scores[:-1]]
         fewest, most = min(filter(None, counts)), max(counts)
         seeds = str(most) if fewest == most else f"{fewest}–{most}"
-        texts = {name: _format_score(score, best[name]) for name, score in of_method.items()}
-        lines.append({"method": method, "seeds": seeds, **texts})
+        texts = map(_format_score, scores, best)
+        lines.append({"method": method, "seeds": seeds, **_name_columns(rows, texts)})
     return lines
 
 
 def _format_score(scores: Summary, best: float) -> str:
-    if not scores.count:
-        return NONE
-    error = f" ± {scores.standard_error:.2g}" if scores.count > 1 else ""
-    text = f"{scores.mean:.1f}{error}"
+    text = _format(scores, ".1f")
     return f"**{text}**" if scores.mean >= best - NEAR * abs(best) else text
+
+
+def _name_columns(rows: Sequence[ResultRow], texts: Iterable[str]) -> dict[str, str]:
+    """Texts of all datasets of the rows, and of the mean over them, by name."""
+    return dict(zip((*dict.fromkeys(row.task for row in rows), MEAN), texts, strict=True))
 
 
 def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -177,42 +158,48 @@ def difference_table(
     """One line per method other than `first` that has `metric`, and one column per dataset: its
     difference to `first` with the same seed, mean ± standard error over the seeds that both have;
     then the mean over datasets if both have rows of all."""
-    values, tasks = _group_by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))
-    lines = []
-    for method in dict.fromkeys(row.method for row in rows if row.method != first):
-        of_tasks = [_subtract(values[method, task], values[first, task]) for task in tasks]
-        if any(of_tasks):
-            texts = dict(zip(tasks, map(_format_difference, of_tasks), strict=True))
-            texts[MEAN] = _format_signed(_summarise_tasks(of_tasks))
+    values, lines = values_by_task(rows, metric), []
+    for method, own in values.items():
+        of_tasks = list(map(subtract, own, values.get(first, [{}] * len(own))))
+        if method != first and any(of_tasks):
+            mean = _format(summarise_tasks(of_tasks)[-1], "+.3g")
+            texts = _name_columns(rows, [*map(_format_difference, of_tasks), mean])
             lines.append({"method": method, **texts})
     return lines
 
 
-def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> Mapping[tuple[str, str], _BySeed]:
-    """The metric, where a row has it, by seeds, of each method and task."""
-    groups: defaultdict[tuple[str, str], _BySeed] = defaultdict(dict)
-    for row in rows:
-        if metric in row.metrics:
-            seeds = row.log_seed, row.training_seed
-            groups[row.method, row.task][seeds] = row.metrics[metric]
-    return groups
+def values_by_task(rows: Sequence[ResultRow], metric: str) -> dict[str, list[BySeed]]:
+    """Of each method: the metric by seeds for every task of the rows."""
+    groups = grouped(rows, lambda row: (row.method, row.task))
+    methods, tasks = (dict.fromkeys(names) for names in zip(*groups, strict=True))
+    return {
+        method: [index_by_seeds(groups.get((method, task), ()), metric) for task in tasks]
+        for method in methods
+    }
 
 
-def _index_by_seeds(rows: Sequence[ResultRow]) -> _BySeed:
-    """What rows are about, by the seeds of the log and of the training."""
-    return {(row.log_seed, row.training_seed): row.value for row in rows}
+def index_by_seeds(rows: Iterable[ResultRow], metric: str | None = None) -> BySeed:
+    """A metric, where rows have it, by the seeds of the log and of the training; None for what the
+    rows are about."""
+    return {
+        (row.log_seed, row.training_seed): row.metrics[metric or row.metric]
+        for row in rows
+        if (metric or row.metric) in row.metrics
+    }
 
 
-def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
-    """Of the means over tasks of each seed; of one mean where tasks differ in their seeds."""
-    first = of_tasks[0]
-    if all(task.keys() == first.keys() for task in of_tasks):
-        return summary(summary(task[seed] for task in of_tasks).mean for seed in first)
-    means = [summary(task.values()) for task in of_tasks]
-    return summary([summary(task.mean for task in means).mean] if all(of_tasks) else [])
+def summarise_tasks(of_tasks: Sequence[BySeed]) -> list[Summary]:
+    """Of each task, then of the means over tasks of each seed: of one mean where tasks differ in
+    their seeds, of none where a task has no value."""
+    summaries = [summary(task.values()) for task in of_tasks]
+    if all(task.keys() == of_tasks[0].keys() for task in of_tasks):
+        means = [summary(task[seeds] for task in of_tasks).mean for seeds in of_tasks[0]]
+    else:
+        means = [summary(own.mean for own in summaries).mean] if all(of_tasks) else []
+    return [*summaries, summary(means)]
 
 
-def _subtract(values: _BySeed, reference: _BySeed) -> _BySeed:
+def subtract(values: BySeed, reference: BySeed) -> BySeed:
     """By how much `values` exceed those of the same seeds in `reference`."""
     # A value that no log or seed changes is compared with each.
     if values.keys() == {(None, None)}:
@@ -222,77 +209,21 @@ def _subtract(values: _BySeed, reference: _BySeed) -> _BySeed:
     }
 
 
-def _format_difference(differences: _BySeed) -> str:
-    """Mean ± standard error over all; with several logs, in brackets that over means of logs."""
-    text = _format_signed(summary(differences.values()))
+def summarise_logs(differences: BySeed) -> Summary:
+    """Of the means over logs."""
     of_logs = grouped(differences.items(), lambda item: item[0][0]).values()
-    over_logs = summary(summary(value for _, value in log).mean for log in of_logs)
-    return text if over_logs.count < 2 else f"{text} ({over_logs.standard_error:.2g})"
+    return summary(summary(value for _, value in log).mean for log in of_logs)
 
 
-def _format_signed(differences: Summary) -> str:
-    """Mean difference with its sign ± its standard error; a dash for none."""
-    if not differences.count:
+def _format_difference(differences: BySeed) -> str:
+    """Mean ± standard error over all; with several logs, in brackets that over means of logs."""
+    text, of_logs = _format(summary(differences.values()), "+.3g"), summarise_logs(differences)
+    return text if of_logs.count < 2 else f"{text} ({of_logs.standard_error:.2g})"
+
+
+def _format(sample: Summary, number: str) -> str:
+    """Mean ± standard error; a dash for no values."""
+    if not sample.count:
         return NONE
-    error = f" ± {differences.standard_error:.2g}" if differences.count > 1 else ""
-    return f"{differences.mean:+.3g}{error}"
-
-
-def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:
-    """One plot per environment, called `kind`-environment: return of every method, mean and
-    standard deviation over seeds."""
-    return _plot_environments(kind, _draw_bars, rows, folder)
-
-
-def plot_distractor(rows: Sequence[ResultRow], folder: Path) -> list[Path]:
-    """One plot per environment with a distractor: returns without it, with it off, and with it on,
-    of rows whose target return is the largest training return."""
-    rows = [row for row in rows if row.conditions["quantiles"] == "1"]
-    planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
-    rows = [row for row in rows if row.environment in planted]
-    return _plot_environments("distractor", _draw_triples, rows, folder)
-
-
-_ByMethod = Mapping[str, Sequence[ResultRow]]
-
-
-def _draw_bars(axes: "Axes", by_method: _ByMethod) -> None:
-    for name, group in by_method.items():
-        returns, color = summary(row.value for row in group), OURS_COLOR if name == OURS else PLAIN
-        axes.barh(name, returns.mean, xerr=returns.sd, color=color, height=0.7)
-    axes.set_xlabel("return per session (mean ± sd over training seeds)")
-
-
-def _draw_triples(axes: "Axes", by_method: _ByMethod) -> None:
-    conditions = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS_COLOR, LIGHT), strict=True)
-    for index, (rate, label, color) in enumerate(conditions):
-        means = []
-        for group in by_method.values():
-            returns = (row.value for row in group if row.conditions["distractor"] == rate)
-            means.append(summary(returns).mean)
-        positions = np.arange(len(by_method)) + 0.25 * (1 - index)
-        axes.barh(positions, means, height=0.25, color=color, label=label)
-    axes.set_yticks(range(len(by_method)), list(by_method))
-    axes.set_xlabel("return per session (mean over training seeds)")
-    axes.legend()
-
-
-@file_style()
-def _plot_environments(
-    kind: str,
-    draw: Callable[["Axes", _ByMethod], None],
-    rows: Sequence[ResultRow],
-    folder: Path,
-) -> list[Path]:
-    from matplotlib.figure import Figure
-
-    files = []
-    environments = grouped(_select_checkpoint(rows), lambda row: row.environment)
-    for environment, group in environments.items():
-        figure, name = Figure(figsize=(5.2, 4.2)), f"{kind}-{environment}"
-        axes = figure.add_subplot()
-        axes.set_title(name)
-        by_method = grouped(group, lambda row: row.method)
-        draw(axes, dict(reversed(by_method.items())))
-        files += save(figure, folder, name)
-    return files
+    error = f" ± {sample.standard_error:.2g}" if sample.count > 1 else ""
+    return f"{sample.mean:{number}}{error}"

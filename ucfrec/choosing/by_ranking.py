@@ -17,7 +17,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
+from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice, RuleRecord
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
@@ -169,20 +169,16 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         if ranked[nearest].overlaps:
             break
         best = rank([(weight + nearest) / 2])
-    halves = []
-    for half in (0, 1):
-        own = _choose_best([candidate.select(users % 2 == half) for candidate in candidates])
-        halves.append(own.rule.reward_weight)
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
-    return RuleChoice(
+    chosen = RuleRecord(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
         "liked items better than the ten most liked ones do, by a standard error; no propensities "
-        f"are used; halves of the users choose reward weights {halves[0]:g} and {halves[1]:g}",
-        candidates=[candidate.summary for candidate in candidates],
+        "are used",
+        tried=len(candidates),
         warning="" if best.overlaps else warning,
-        details={"reward_weights_of_halves": halves},
     )
+    return chosen, [candidate.summary for candidate in candidates]
 
 
 @dataclass(frozen=True)
@@ -199,17 +195,13 @@ class _Candidate:
     ahead: Float64Array
     """(M,) 1 for a liked item that only the rule shows, −1 for one that only the baseline does."""
 
-    def select(self, rows: BoolArray) -> "_Candidate":
-        names = ("users", "rates", "liked", "hits", "ahead")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
-
     @cached_property
     def summary(self) -> RankedRule:
         count = max(1, int(self.liked.sum()))
         gain = float(self.ahead.sum()) / count
         return RankedRule(
             rule=self.rule,
-            item_rate=float(self.rates.mean()) if len(self.rates) else 0.0,
+            item_rate=float(self.rates.mean()),
             hits=float(self.hits[self.liked].sum()) / count,
             gain=gain,
             gain_error=self._error_of_sum(self.ahead - gain * self.liked) / count,
@@ -223,7 +215,7 @@ class _Candidate:
     def levels_with(self, top: "_Candidate") -> bool:
         """Whether the rate is not below that of another rule by more than a standard error."""
         below = top.rates - self.rates
-        return not len(below) or bool(below.sum() <= self._error_of_sum(below - below.mean()))
+        return bool(below.sum() <= self._error_of_sum(below - below.mean()))
 
     def _error_of_sum(self, values: Float64Array) -> float:
         """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""

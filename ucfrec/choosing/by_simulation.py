@@ -24,7 +24,7 @@ from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.by_ranking import LoggedEvidence
-from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
+from ucfrec.choosing.choice import Problem, RuleChoice, RuleRecord, SimulatedRule, ValueEstimate
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.processes import progress
@@ -243,7 +243,6 @@ class RuleSearch:
             rule=rule,
             value=float(sessions.returns.mean()),
             error=_standard_error(sessions.returns),
-            length=float(sessions.lengths.mean()),
             support=float(self._supported[sessions.items].mean()),
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
@@ -403,36 +402,16 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         candidates = [*(item for item in candidates if item.rule not in again), *finalists]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
-    return RuleChoice(
+    chosen = RuleRecord(
         rule=best.rule,
-        chosen_by=_describe_choice(search.users) + where,
-        candidates=[best if item.rule == best.rule else item for item in candidates],
+        chosen_by=f"mean return of simulated sessions{where}",
         warning=_warning(search, best, estimate),
+        tried=len(candidates),
         estimate=estimate,
-        details={
-            **search.users.report,
-            "least_items": search.least_items,
-            "least_users": search.least_users,
-            "halves_agree": list(agree),
-        },
+        halves_agree=agree,
+        session_end=search.users.session_end_report,
     )
-
-
-def _describe_choice(users: UserModel) -> str:
-    if users.training_users is None:
-        return (
-            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
-            "propensities are used"
-        )
-    report, calibration = users.training_users.report, users.calibration_report
-    whose = "new users" if users.reward_report.new_users else "validation users"
-    weights = "weighted by their propensities" if report.weighted else "without weights"
-    if calibration and calibration.weighted:
-        weights += ", and calibrated by propensities"
-    return (
-        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
-        f"are fitted to {report.steps:,} training rows {weights}"
-    )
+    return chosen, [best if item.rule == best.rule else item for item in candidates]
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:

@@ -1,16 +1,19 @@
 """The choice of a decision rule: its settings, what it is chosen by, and what was chosen."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 from pydantic import Field
 
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import DecisionRule, SavedRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.files import record
+from ucfrec.files.record import Entry, Text
 from ucfrec.settings import Count, Share, Weight, settings_table
 from ucfrec.user_model.model import UserModel
+from ucfrec.user_model.session_end import SessionEndReport
 
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
@@ -118,7 +121,6 @@ class SimulatedRule:
     value: float
     """Mean return of a session, in reward units."""
     error: float
-    length: float
     support: float
     """Share of decisions on items that the log supports."""
     items: float
@@ -159,26 +161,21 @@ class RankedRule:
     gain_error: float
 
 
-@dataclass(frozen=True)
-class RuleChoice:
-    """The rule that was chosen, and all candidates."""
+class RuleRecord(Entry):
+    """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""
 
-    rule: DecisionRule
-    chosen_by: str
-    candidates: Sequence[SimulatedRule | RankedRule]
+    rule: SavedRule
+    chosen_by: Text
+    warning: Text = ""
+    """What is wrong with the rule; empty if nothing is."""
+    tried: record.Count = 0
+    """Number of candidates."""
     estimate: ValueEstimate | None = None
     """Its value; None for a rule that was not simulated."""
-    warning: str = ""
-    """What is wrong with the rule; empty if nothing is."""
-    details: Mapping[str, Any] = field(default_factory=dict)
-    """What else the choice rests on, as a JSON object."""
+    halves_agree: tuple[bool, bool] | None = None
+    """Whether the sessions of either half of the users would choose the rule, too."""
+    session_end: SessionEndReport | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """As a JSON object, without the candidates; `details` are entries like the others."""
-        values = asdict(replace(self, candidates=()))
-        del values["candidates"]
-        return {**values, **values.pop("details"), "tried": len(self.candidates)}
 
-    def list_candidates(self) -> list[dict[str, Any]]:
-        """The candidates as JSON objects."""
-        return [{**asdict(entry), "rule": entry.rule.as_dict()} for entry in self.candidates]
+RuleChoice = tuple[RuleRecord, Sequence[SimulatedRule | RankedRule]]
+"""The rule that was chosen, and all candidates."""

@@ -2,7 +2,7 @@
 options of all commands that measure the cells of a benchmark."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,7 +14,6 @@ from ucfrec.plugins import load_plugin
 from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 
 if TYPE_CHECKING:
-    from ucfrec.benchmark.cells import Cell, Measurement
     from ucfrec.benchmark.suite import Benchmark as Suite
 
 _LOGS = Group("logs and seeds")
@@ -60,33 +59,6 @@ class GridOptions(Table):
             f"{self.rows_file} has no rows of {', '.join([suite, *tables])}; name a file that has "
             "them with --results"
         )
-
-    def make_rows(
-        self,
-        suite: str,
-        tables: Sequence[str],
-        list_cells: "Callable[[], Iterable[Cell]]",
-        how: "Measurement",
-        describe: str = "",
-    ) -> list[ResultRow]:
-        """The rows that a command shows: with --show-only those of the file, else those of cells,
-        which are measured where they have none.
-
-        Args:
-            tables: tables of the suite; empty for all.
-            list_cells: lists what to measure; writes the stores that it needs.
-            describe: name of the benchmark in progress output; "" for `suite`.
-
-        Raises:
-            InputError: as `read_rows`, as `list_cells`, or as `run_grid`.
-        """
-        if self.show_only:
-            return self.read_rows(suite, tables)
-        from ucfrec.benchmark.grid import run_grid
-
-        file, describe = self.rows_file, describe or suite
-        with benchmarking(file):
-            return run_grid(list_cells(), how, file, self.workers, describe, self.again)
 
 
 class Benchmark(EnvironmentOptions, GridOptions):

@@ -5,7 +5,6 @@ command loads what only another one needs.
 """
 
 import argparse
-import copy
 import os
 import re
 import sys
@@ -143,13 +142,13 @@ def explanation(error: BaseException) -> str | None:
         return f"{error.name} is not installed; install ucfrec[{extra}]"
     text = str(error)
     if isinstance(error, MemoryError) or re.search(_NO_MEMORY, text):
-        reason = f" ({text:.120})" if text else ""
+        reason = f" ({text})" if text else ""
         return (
             f"memory is exhausted{reason}; close other programs, raise the limit (ulimit -v), or "
             "use smaller settings"
         )
     if re.search(_NO_SPACE, text):
-        return f"no space is left on a disk ({text:.120}); free space and run again"
+        return f"no space is left on a disk ({text}); free space and run again"
     return None
 
 
@@ -214,20 +213,13 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
         dest="command", required=True, metavar="COMMAND", parser_class=_CommandParser
     )
     called = next((word for word in arguments if word in program.commands), None)
-    helps = any(word.startswith(("-h", "--h")) for word in arguments)
+    how: dict[str, Any] = {"formatter_class": _Formatter, "add_help": False}
     for name, summary in program.commands.items():
-        command = commands.add_parser(name, description=summary, prog=f"{program.name} {name}")
+        how |= {"description": summary, "prog": f"{program.name} {name}"}
+        command = commands.add_parser(name, **how)
         if name == called:
-            add_options(command, program.find_table(name), helps)
+            add_options(command, program.find_table(name), arguments)
     return parser
-
-
-class _ShowAll(argparse.Action):
-    """`--help-all`."""
-
-    def __call__(self, parser: Any, *_: object) -> None:
-        print(parser.format_help(everything=True), end="")
-        parser.exit()
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -238,19 +230,13 @@ class _Formatter(argparse.HelpFormatter):
 
 
 class _CommandParser(argparse.ArgumentParser):
-    """Options before, between and after runs and logs (`ope RUN --json FILE LOGS`); help that fits
-    one screen.
+    """Options before, between and after runs and logs (`ope RUN --json FILE LOGS`).
 
     A plain parser gives all that a list of files may take to its first words, and does not know
     those after an option.
     """
 
     _intermixed = False
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(formatter_class=_Formatter, **settings)
-        text = "describe all options"
-        self.add_argument("--help-all", action=_ShowAll, nargs=0, help=text)
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         # It calls this method: once for the options, once for the rest.
@@ -261,36 +247,6 @@ class _CommandParser(argparse.ArgumentParser):
             return self.parse_known_intermixed_args(args, namespace)
         finally:
             self._intermixed = False
-
-    def format_help(self, everything: bool = False) -> str:
-        """The help; without `everything`, options of titled groups by name only, and of the others
-        what comes before a semicolon."""
-        formatter = self._get_formatter()
-        formatter.add_usage(self.usage, self._actions, [])
-        formatter.add_text(self.description)
-        titled: list[argparse.Action] = []
-        for group in self._action_groups:
-            actions = group._group_actions
-            if everything or group in (self._positionals, self._optionals):
-                formatter.start_section(group.title)
-                formatter.add_text(group.description if everything else None)
-                for action in actions:
-                    if everything:
-                        formatter.add_argument(action)
-                    elif "--help" not in action.option_strings:
-                        short = copy.copy(action)
-                        short.help = (action.help or "").partition(";")[0]
-                        formatter.add_argument(short)
-                formatter.end_section()
-            elif actions:
-                names = ", ".join(action.option_strings[0] for action in actions)
-                titled.append(argparse.Action([], str(group.title), help=names))
-        if titled:
-            formatter.start_section("more, described by --help-all")
-            formatter.add_arguments(titled)
-            formatter.end_section()
-        formatter.add_text(self.epilog)
-        return formatter.format_help()
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ class Demo(Table):
 
         config = FULL if self.full else DemoConfig()
         out = self.out or Path("demo-out-full" if self.full else "demo-out")
-        _say(
+        print(
             f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
             f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
             f"simulators. Everything goes to {out}."
@@ -95,18 +95,13 @@ class Demo(Table):
         with lock_path(out, "filled"):
             remove_leftovers(out.parent)
             rows = demo(out, self.seed, config)
-        _say(f"\n{evaluation_table(rows)}\n")
-        _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
+        print(f"\n{evaluation_table(rows)}\n")
+        print("What this shows (return: sum of the rewards of a session; [95% interval]):")
         for environment in ENVIRONMENTS:
             by_method = {row.method: row for row in rows if row.environment == environment}
-            _say(conclusion(environment, by_method))
-        _say(f"Report with all curves and tables: {out / 'report.html'}")
-        _say("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
-
-
-def _say(text: str) -> None:
-    """Print at once, so that a pipe shows each line when it is due."""
-    print(text, flush=True)
+            print(conclusion(environment, by_method))
+        print(f"Report with all curves and tables: {out / 'report.html'}")
+        print("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
 
 def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
@@ -134,16 +129,15 @@ def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
 
 
 def _describe_value(row: "ResultRow") -> str:
-    low, high = row.interval or (row.value, row.value)
-    return f"{row.value:.3g} [{low:.3g}, {high:.3g}]"
+    return f"{row.value:.3g} [{row['R_cum_low']:.3g}, {row['R_cum_high']:.3g}]"
 
 
 def _compare(row: "ResultRow", reference: "ResultRow", name: str) -> str:
     """How a return compares with another one, by 95% intervals that do not overlap."""
-    (low, high), (least, most) = (r.interval or (r.value, r.value) for r in (row, reference))
-    if low > most:
+    if row["R_cum_low"] > reference["R_cum_high"]:
         return f"above {name}"
-    return f"below {name}" if high < least else f"level with {name} (the intervals overlap)"
+    below = row["R_cum_high"] < reference["R_cum_low"]
+    return f"below {name}" if below else f"level with {name} (the intervals overlap)"
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
@@ -164,7 +158,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
-        _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
+        print(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
         collect_store(Environment(environment), out / environment, config.sessions, seed)
     jobs = [
         (environment, name) for environment in ENVIRONMENTS for name in config.names(environment)
@@ -177,11 +171,11 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     with pool_of_processes(workers) as pool:
         with block_ctrl_c():
             futures = {pool.submit(_learn, out / job[0], job[1], seed, config): job for job in jobs}
-        _say(f"Training {len(jobs)} policies, {workers} at a time …")
+        print(f"Training {len(jobs)} policies, {workers} at a time …")
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for future in as_completed(futures):
                 row = rows[futures[future]] = future.result()
-                _say(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
+                print(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
                 bar.update()
     ordered, runs = [], []
     for environment in ENVIRONMENTS:
@@ -207,7 +201,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     from ucfrec.evaluation.evaluate import evaluate_policy
     from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
-    from ucfrec.runs.run import SharedStages, train_run
+    from ucfrec.runs.run import train_run
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     torch.set_num_threads(1)
@@ -215,7 +209,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     size = [f"policy.dim={config.dim}"]
     size += [] if policy == "bc" else [f"policy.context={config.context}"]
     resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
-    run, shared = folder / name, SharedStages(folder / "stages")
+    run, shared = folder / name, folder / "stages"
     with label_progress(f"{folder.name}, {name}"):
         train_run(EpisodeStore.open(folder / "store"), run, resolved, shared=shared)
         trained, environment = TrainedPolicy.load(run), Environment(folder.name)

@@ -3,9 +3,10 @@ policy; `rank`: how policies rank what users were shown and clicked later."""
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
@@ -22,6 +23,7 @@ from ucfrec.files.remote import origin
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Selection
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.rows import Ranking, ResultRow
@@ -71,7 +73,6 @@ class Ope(RuleOptions, LogOptions):
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
         from ucfrec.results.rows import write_results
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
         settings = settings_given(self, evaluate.EstimateOptions)
@@ -85,20 +86,21 @@ class Ope(RuleOptions, LogOptions):
                 "--scored takes probabilities as they are; give --filter-seen to score"
             )
         # On the test split, the weights that have not learned from it.
-        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
-        parts = ("run", "target return", "temperature")
+        parts = [(policy.folder, rule) for policy, rules in candidates for rule in rules]
         names = names_of(
             [
-                dict(zip(parts, (str(p.folder), rule.target, rule.temperature), strict=True))
-                for p, rules in candidates
-                for rule in rules
+                {"run": str(run), "target return": rule.target, "temperature": rule.temperature}
+                for run, rule in parts
             ]
         )
         reports: dict[str, OffPolicyReport] = {}
         for policy, rules in candidates:
-            reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
-            with nullcontext() if self.scored else reading as logged:
+            reading: AbstractContextManager[LoggedSessions | None] = nullcontext()
+            if not self.scored:
+                reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+            with reading as logged:
                 if logged is not None and logs:
                     print(format_summary(logged.report))
                 elif logged is not None:
@@ -118,17 +120,14 @@ class Ope(RuleOptions, LogOptions):
                         checkpoint=self.checkpoint,
                     )
                     print(_describe(reports[name]))
-        columns: dict[str, dict[str, object]] = {name: {"candidate": name} for name in reports}
-        if len(reports) > 1:
-            choice = choose(reports, self.seed)
+        choice = choose(reports, self.seed) if len(reports) > 1 else None
+        if choice is not None:
             print(_describe_choice(choice))
-            columns = {name: {"candidate": name, **choice.columns(name)} for name in reports}
+        rows = []
+        for name, report in reports.items():
+            columns = {"candidate": name} | (choice.columns(name) if choice else {})
+            rows += [row.extended(columns) for row in (*report.rows, *report.step_rows)]
         if self.json is not None:
-            rows = [
-                row.extended(columns[name])
-                for name, report in reports.items()
-                for row in (*report.rows, *report.step_rows)
-            ]
             write_results(self.json, rows)
 
     def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":
@@ -232,21 +231,22 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
 
     filter_seen: bool = False
     out: Annotated[Path, OUTPUT]
-    """Parquet file (with --engine spark: folder) to write."""
+    """Parquet or CSV file (with --engine spark: folder) to write; ope reads Parquet."""
     engine: Literal["torch", "spark"] = "torch"
     """What computes the probabilities: this process; or Spark's workers, each for some of the
     users, which write the parts of a folder --out"""
 
     def execute(self) -> None:
-        """Write the policy's probability of every logged choice as Parquet."""
-        from ucfrec.files.parquet import write_frames
+        """Write the policy's probability of every logged choice."""
+        from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.logs.summary import format_report
         from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        if (master := self.find_spark()) is None:
+            require_table_names([self.out])
+        trained = self.load(self.run)
         rule = self.make_rule(trained)
-        if (master := self.find_spark()) is not None:
+        if master is not None:
             from ucfrec.off_policy.scored import score_with_spark
 
             files, mapping = self.find_logs(self.logs, trained, [self.out])
@@ -295,10 +295,9 @@ class Rank(LogOptions, RuleOptions):
         from ucfrec.logs.summary import format_summary
         from ucfrec.provenance import shorten_paths
         from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
-        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        policies = [self.load(run, split=not logs) for run in runs]
         require_one_catalogue(policies)
         with self.read_sessions(policies, logs, self.json) as logged:
             if logs:
@@ -354,5 +353,5 @@ def _conclude_ranking(ranking: "Ranking", run: Path) -> str:
     return (
         f"\n{rows[best].method} has the highest hit rate on liked items ({rates[best]:.3f} with "
         f"{rows[best].conditions['k']} items){first}. Logged clicks favour what was shown:\n"
-        f"next: ucfrec ope {run}, the return per session that it would bring"
+        f"next: ucfrec ope {quote(str(run))}, the return per session that it would bring"
     )

@@ -9,10 +9,10 @@ import argparse
 import ast
 import inspect
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
+from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
@@ -102,10 +102,18 @@ def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[s
 
 
 def add_options(
-    parser: argparse.ArgumentParser, table: type[Table], described: bool = True
+    parser: argparse.ArgumentParser, table: type[Table], arguments: Sequence[str]
 ) -> None:
-    """Add the options of a command to its parser, in groups, with their help if it is shown."""
+    """Add the options of a command to its parser, in groups, with the help that is asked for: all,
+    or what fits one screen, with options of titled groups by name only, and of the others what
+    comes before a semicolon."""
+    shown = any(word.startswith(("-h", "--h")) for word in arguments)
+    everything = any(word.startswith("--help-") for word in arguments)
+    text = "show this help message and exit" if everything else argparse.SUPPRESS
+    parser.add_argument("-h", "--help", action="help", help=text)
+    parser.add_argument("--help-all", action="help", help="describe all options")
     groups: dict[Any, Any] = {"": parser}
+    hidden: dict[str, list[str]] = {}
     usage, hints = ["%(prog)s"], get_type_hints(table, include_extras=True)
     for field in fields(table):  # type: ignore[arg-type]
         hint = hints[field.name]
@@ -114,7 +122,7 @@ def add_options(
         titles = [mark for mark in marks if isinstance(mark, Group)]
         title, _, more = (titles or [Group(vars(owner).get("title") or "")])[0].partition("; ")
         if title not in groups:
-            groups[title] = parser.add_argument_group(title, more or None)
+            groups[title] = parser.add_argument_group(title, (everything and more) or None)
         group = groups[title]
         if EXCLUSIVE in marks:
             if owner not in groups:
@@ -123,7 +131,12 @@ def add_options(
         name = f"--{field.name.replace('_', '-')}"
         if ARGUMENT in marks:
             name, group = field.name, parser
-        text = _describe(owner, field, marks).replace("%", "%%") if described else None
+        text = _describe(owner, field, marks).replace("%", "%%") if shown else ""
+        if not everything:
+            text = text.partition(";")[0]
+            if title and group is not parser:
+                hidden.setdefault(title, []).append(name)
+                text = argparse.SUPPRESS
         action = group.add_argument(name, help=text, **_read_words(kind, marks, field.default))
         word = str(action.metavar or field.name.upper())
         if ARGUMENT in marks:
@@ -131,6 +144,11 @@ def add_options(
             usage.append(f"[{word}]" if action.nargs in ("?", "*") else word)
         elif action.required:
             usage.append(f"{name} {word}")
+    if hidden:
+        short = parser.add_argument_group("more, described by --help-all")
+        short._group_actions += [
+            argparse.Action([], title, help=", ".join(names)) for title, names in hidden.items()
+        ]
     parser.usage, parser.epilog = table.usage or " ".join([*usage, "[options]"]), table.epilog
 
 
@@ -170,20 +188,18 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
 def _read_number(limits: range, word: str) -> int:
     if not word.isdecimal() or len(word) > 19 or int(word) not in limits:
         most = f"to {limits.stop - 1}" if limits.stop < POSITIVE.stop else "on"
-        raise argparse.ArgumentTypeError(
-            f"{word:.40} is not a whole number from {limits.start} {most}"
-        )
+        raise argparse.ArgumentTypeError(f"{word} is not a whole number from {limits.start} {most}")
     return int(word)
 
 
 def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> str:
     """The help of an option, with its default if that is a value."""
-    text, _ = _read_docstrings(owner.__module__)[f"{owner.__name__}.{field.name}"]
+    text, _ = read_docstrings(owner.__module__)[f"{owner.__name__}.{field.name}"]
     default = field.default
     if not text:
         module, _, table = owner.described_by.partition(":")
         name = f"{table}.{field.name.removeprefix(owner.prefix)}"
-        text, borrowed = _read_docstrings(module)[name]
+        text, borrowed = read_docstrings(module)[name]
         text = text[:1].upper() + text[1:]
         if vars(owner).get("shows_defaults", True):
             text = re.sub(r"[;,] None for ([^.]*)", r" (default: \1)", text)
@@ -196,13 +212,12 @@ def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> 
 
 
 @cache
-def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
+def read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     """`CLASS.FIELD` and `CLASS.METHOD.ARGUMENT` of a module to what its source says of them, on one
     line, and to the default of a field."""
-    package, *names = module.split(".")
-    file = Path(sys.modules[package].__path__[0]).joinpath(*names).with_suffix(".py")
-    texts = {}
-    for cls in ast.parse(file.read_text(encoding="utf-8")).body:
+    spec, texts = find_spec(module), {}
+    source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
+    for cls in ast.parse(source).body:
         if not isinstance(cls, ast.ClassDef):
             continue
         for line, next_line in zip_longest(cls.body, cls.body[1:]):

@@ -1,12 +1,12 @@
 """`ucfrec prepare`: turn logs into an episode store; `datasets`: find public ones."""
 
-import warnings
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table, settings_given
 from ucfrec.commands.shared_options import LogOptions, SparkOption
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.remote import origin
 
 
@@ -67,7 +67,7 @@ class Prepare(LogOptions, SparkOption):
         store = origin(self.out)
         print(
             f"\nstore: {store}; policies learn from its train split, later rows validate and test "
-            f"them\nnext: ucfrec train {store} --out RUN"
+            f"them\nnext: ucfrec train {quote(store)} --out RUN"
         )
 
 
@@ -94,7 +94,7 @@ class Datasets(Table):
             try:
                 datasets[name] = load_plugin("datasets", name)
             except InputError as error:
-                warnings.warn(str(error), InputNote, stacklevel=2)
+                warn_user(str(error))
         if self.name is None:
             lines = [
                 (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)
@@ -110,8 +110,8 @@ class Datasets(Table):
         logs = load_release(adapter, datasets[adapter], self.name, self.folder, self.part)
         release = datasets[adapter].releases[self.name]
         part = release.parts[self.part or next(iter(release.parts))]
+        place = quote(str(self.folder / self.name / part))
         print(
             f"{self.name}: {len(logs.files)} log files; {release.licence}, {release.homepage}\n"
-            f"next: ucfrec prepare '{self.folder / self.name / part}' --dataset {adapter} "
-            "--out store"
+            f"next: ucfrec prepare {place} --dataset {adapter} --out store"
         )

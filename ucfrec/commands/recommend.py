@@ -2,7 +2,6 @@
 chooses them."""
 
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +16,7 @@ from ucfrec.commands.shared_options import (
     RunArgument,
     SparkOption,
 )
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.processes import progress
 
@@ -33,12 +32,13 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()
     """Log files, folders or globs; also at s3://, …"""
     out: Annotated[Path | None, OUTPUT] = None
-    """Parquet file (with --engine spark: folder) to write."""
+    """Parquet or CSV file (with --engine spark: folder) to write."""
     stream: bool = False
     """Instead of LOGS and --out: read requests from stdin, JSON on each line, and write answers to
     stdout; see docs/serving.md"""
     candidates: Annotated[Path | None, "FILE"] = None
-    """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
+    """The only items to recommend; Parquet or CSV with a column item_id, or with the name
+    that the log of the run has for it (default: all)"""
     new_session: Annotated[bool, Group("answering")] = False
     """Recommend for the first step of a new session (default: the user's latest one goes on)"""
     at: Annotated[str | None, Group("answering"), "TIME"] = None
@@ -51,7 +51,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     seconds at the start; with spark, each worker writes a part of the folder --out"""
 
     def execute(self) -> None:
-        """Write the recommendations as Parquet, or answer a stream."""
+        """Write the recommendations, or answer a stream."""
         if self.stream:
             self._answer_stream()
             return
@@ -59,13 +59,13 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             raise InputError(
                 "name LOGS after the run and the file to write with --out; or give --stream"
             )
-        from ucfrec.files.parquet import write_frames
+        from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.recommending.histories import histories_of_files
         from ucfrec.recommending.recommend import recommend
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained, index = TrainedPolicy.load(self.run, self.checkpoint), None
-        master = self.find_spark()
+        if (master := self.find_spark()) is None:
+            require_table_names([self.out, self.exposures])
+        trained, index = self.load(self.run), None
         files, mapping = self.find_logs(self.logs, trained, [self.out, self.exposures])
         how: Any = {
             "rule": (rule := self.make_rule(trained)),
@@ -131,23 +131,20 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             return None
         from ucfrec.reporting.training import read_features
 
-        table = read_features(self.candidates, text_ids=True)
+        table = read_features(self.candidates, [trained.record.data], text_ids=True)
         column = table.column(schema.ITEM_ID).drop_null()
         ids: Array = column.unique().to_numpy(zero_copy_only=False)
         in_run = trained.items.numbers(ids) >= 0
         if in_run.all() or not in_run.any():
             return ids
-        warnings.warn(
+        warn_user(
             f"{self.candidates}: the run does not know {int((~in_run).sum()):,} of {len(ids):,} "
-            "items, which are not recommended; prepare and train on logs with them",
-            InputNote,
-            stacklevel=2,
+            "items, which are not recommended; prepare and train on logs with them"
         )
         return ids[in_run]
 
     def _answer_stream(self) -> None:
         from ucfrec.recommending.stream import answer_stream
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         refusals = {
             "--stream reads stdin and writes stdout; leave LOGS and --out out": self.logs
@@ -162,7 +159,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         for message, refused in refusals.items():
             if refused:
                 raise InputError(message)
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         # Unbuffered, so that a request is answered without waiting for the next ones.
         with (
             closing(self.make_responder(trained)) as responder,
@@ -171,7 +168,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         ):
             counts = answer_stream(responder, source, sys.stdout.buffer, exposures=exposures)
         print(
-            f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors",
+            f"ucfrec recommend: {counts['answers']:,} answers, {counts['errors']:,} errors",
             file=sys.stderr,
         )
 
@@ -188,9 +185,8 @@ class Export(RuleOptions, RunArgument):
     def execute(self) -> None:
         """Write the policy with its rule as an ONNX graph, and compare it with torch."""
         from ucfrec.recommending.export import export
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
-        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        trained = self.load(self.run)
         written = export(trained, self.onnx, rule=self.make_rule(trained), k=self.k)
         print(
             f"{self.onnx}: {written.size / 1e6:,.1f} MB, scores equal torch's to "

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, Table
@@ -19,8 +20,8 @@ class Report(Table):
     """Results to show: JSON or JSON lines (.jsonl) of `ucfrec evaluate --json`, `ucfrec ope --json`
     or `ucfrec demo` (default: none)"""
     items: Annotated[Path | None, "FILE"] = None
-    """Item features to show with the sample recommendations: Parquet or CSV with a column item_id
-    (default: none)"""
+    """Item features to show with the sample recommendations: Parquet or CSV with a column item_id,
+    or with the name that the log of the run has for it (default: none)"""
     out: Annotated[Path, "FILE"] = Path("report.html")
     """HTML file to write."""
 
@@ -62,7 +63,7 @@ class Promote(Table):
         previous = f", before it {pointer.previous[-1]}" if pointer.previous else ""
         print(f"current run: {pointer.current}{previous} ({folder / POINTER})")
         if not self.back:
-            print(f"next: ucfrec serve {folder}, which follows it; --back returns")
+            print(f"next: ucfrec serve {quote(str(folder))}, which follows it; --back returns")
 
 
 class Verify(Table):

@@ -54,15 +54,21 @@ class Serve(AnswerOptions):
     max_batch: Annotated[int | None, _SERVER, "N"] = None
     max_queue: Annotated[int | None, _SERVER, "N"] = None
     timeout: Annotated[float | None, _SERVER, "TIMEOUT"] = None
+    max_connections: Annotated[int | None, _SERVER, "N"] = None
+    max_connections_of_address: Annotated[int | None, _SERVER, "N"] = None
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.server import MOST, Workers
+        from ucfrec.recommending.server import (
+            MOST,
+            PrintingServer,
+            Workers,
+            listening_socket,
+            ready_line,
+        )
 
         if not 1 <= self.workers <= MOST:
             raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
-        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
-
         address = listening_socket(self.host, self.port)
         if self.workers == 1:
             self._serve(address, PrintingServer)
@@ -92,7 +98,6 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.server import server_config
         from ucfrec.recommending.web import ServerLimits, application
         from ucfrec.runs.record import RUN, verify_run
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         several, threads = self.workers > 1, self.threads
         if threads is None and several:
@@ -104,7 +109,7 @@ class Serve(AnswerOptions):
 
         def make(run: Path) -> "Responder":
             verify_run(run)
-            return self.make_responder(TrainedPolicy.load(run, self.checkpoint))
+            return self.make_responder(self.load(run))
 
         shares = None if self.split is None else parse_split(self.split)
         folder = self.run.resolve()
@@ -119,6 +124,9 @@ class Serve(AnswerOptions):
             hosts = list_hosts(self.allowed_hosts, self.host)
             config = server_config(
                 application(served, limits, hosts, exposures, several),
+                limits.timeout,
+                limits.connections,
+                limits.connections_of_address,
                 timeout_graceful_shutdown=int(limits.timeout) + 1,
                 workers=self.workers,
             )
@@ -136,7 +144,7 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.server import Server
 
         def make_server(config: "uvicorn.Config", what: str) -> Server:
-            server = Server(config, lambda _: parent.ready(what))
+            server = Server(config, lambda _: parent.report("ready", what))
             parent.ends(server)
             return server
 
@@ -149,7 +157,7 @@ class Serve(AnswerOptions):
             why = explanation(error)
             if why is None:
                 traceback.print_exc()
-            parent.failed(why or "a worker failed; see the traceback")
+            parent.report("failed", why or "a worker failed; see the traceback")
 
 
 def list_hosts(hosts: str | None, address: str) -> tuple[str, ...]:
@@ -172,8 +180,9 @@ class Explore(Table):
     runs: Annotated[Sequence[Path], ARGUMENT, "RUN"]
     """Run folder of `ucfrec train`; two are shown side by side."""
     items: Annotated[Path | None, "FILE"] = None
-    """Item features to show: Parquet or CSV with a column item_id; title (or name) and image_url
-    (or image) are shown as such (default: none)"""
+    """Item features to show: Parquet or CSV with a column item_id, or with the name that the log
+    of the run has for it; title (or name) and image_url (or image) are shown as such (default:
+    none)"""
     results: Annotated[Sequence[Path], "FILE…"] = ()
     """Results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict (default:
     none)"""
@@ -187,8 +196,9 @@ class Explore(Table):
         from ucfrec.reporting.training import read_features
         from ucfrec.runs.trained_policy import TrainedPolicy
 
-        features = None if self.items is None else read_features(self.items)
         runs = [TrainedPolicy.load(run) for run in self.runs]
+        logs = [run.record.data for run in runs]
+        features = None if self.items is None else read_features(self.items, logs)
         explorer = Explorer(runs, features, self.results)
         config = server_config(application(explorer, ("localhost", "127.0.0.1", "[::1]")))
         with listening_socket("127.0.0.1", self.port) as listening:

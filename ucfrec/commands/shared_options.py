@@ -1,8 +1,8 @@
 """Options that several commands share, and the objects that they stand for."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -95,25 +95,21 @@ class LogOptions(Table):
         require_other_files((path for path in outputs if path is not None), inputs)
         return files, mapping
 
-    @contextmanager
     def read_sessions(
         self,
         policies: "Sequence[TrainedPolicy]",
         logs: Sequence[str],
         output: Path | None,
         keep_unknown: bool = False,
-    ) -> "Iterator[LoggedSessions]":
+    ) -> "AbstractContextManager[LoggedSessions]":
         """Sessions of logs, read as the first policy was trained; those of the test split of the
         policies' store if no logs are named."""
         from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
 
         if not logs:
-            yield held_out_sessions(policies)
-            return
+            return nullcontext(held_out_sessions(policies))
         files, mapping = self.find_logs(logs, policies[0], [output])
-        limit = self.memory_limit
-        with read_logged_sessions(policies[0], files, mapping, keep_unknown, limit) as logged:
-            yield logged
+        return read_logged_sessions(policies[0], files, mapping, keep_unknown, self.memory_limit)
 
 
 class SparkOption(Table):
@@ -145,7 +141,7 @@ class RuleOptions(Table):
     shows_defaults = False
 
     checkpoint: Literal["best", "last"] = "best"
-    """Policy weights: of the lowest validation loss, or the last ones."""
+    """Policy weights; of the lowest validation loss, or the last ones, of runs without a refit"""
     target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
     """Target return, in units of the reward, of a session; of every step with a horizon or
     discount"""
@@ -164,6 +160,18 @@ class RuleOptions(Table):
     exclude_seen: bool = False
     tag_window: Annotated[int | None, "N"] = None
     tag_run: Annotated[int | None, "N"] = None
+
+    def load(self, run: Path, split: bool = False) -> "TrainedPolicy":
+        """The policy of a run, with the weights that the command line names."""
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        trained = TrainedPolicy.load(run, self.checkpoint, split=split)
+        if self.checkpoint == "last" and trained.record.refit_of is not None:
+            raise InputError(
+                f"--checkpoint last: {run} acts by weights that went on learning from all rows to "
+                "the end, of which there is one checkpoint; leave it out, or train with --no-refit"
+            )
+        return trained
 
     def make_rule(self, trained: "TrainedPolicy") -> "DecisionRule":
         """The run's decision rule with the parts that the command line names."""
@@ -188,8 +196,8 @@ class AnswerOptions(RuleOptions):
     k: Annotated[int, Group("")] = 10
     """Items for each user; if a request does not say how many."""
     exposures: Annotated[Path | None, Group(""), "PATH"] = None
-    """Write what was shown, with its probability, as Parquet; a folder of files for requests; see
-    docs/exposures.md"""
+    """Write what was shown, with its probability: a file (Parquet or CSV), a folder of Parquet
+    files for requests; see docs/exposures.md"""
     keep_seen: Annotated[bool, Group("")] = False
     """Also recommend items that the user has seen; (default: leave them out)"""
     skip_unknown: bool = False
@@ -217,16 +225,15 @@ class AnswerOptions(RuleOptions):
             engine=self.engine,
         )
 
-    @contextmanager
-    def open_exposures(self, trained: "TrainedPolicy") -> "Iterator[ExposureLog | None]":
+    def open_exposures(
+        self, trained: "TrainedPolicy"
+    ) -> "AbstractContextManager[ExposureLog | None]":
         """Where a server's answers are written; None for nowhere."""
         from ucfrec.recommending.exposures import ExposureLog
 
         if self.exposures is None:
-            yield None
-            return
-        with closing(ExposureLog(self.exposures, trained)) as log:
-            yield log
+            return nullcontext()
+        return closing(ExposureLog(self.exposures, trained))
 
 
 class EnvironmentOptions(Table):

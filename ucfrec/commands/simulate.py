@@ -1,5 +1,6 @@
 """`ucfrec evaluate` and `collect`: policies in a simulated environment, and logs of it."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -37,15 +38,14 @@ class Evaluate(SimulationOptions, RuleOptions):
         """Print one row per policy."""
         from ucfrec.reporting.measuring import evaluate_in
         from ucfrec.reporting.tables import evaluation_table
-        from ucfrec.runs.trained_policy import TrainedPolicy
 
         environment = self.make_environment(self.env)
         if not self.runs and not self.behavior:
             raise InputError("name a run folder, or a built-in policy with --behavior")
-        policies = {run: TrainedPolicy.load(run, self.checkpoint) for run in self.runs}
+        policies = [self.load(run) for run in dict.fromkeys(self.runs)]
         evaluation = evaluate_in(
             environment,
-            {run: (policy, self.make_rule(policy)) for run, policy in policies.items()},
+            [(policy, self.make_rule(policy)) for policy in policies],
             self.behavior,
             episodes=self.episodes,
             seed=self.seed,
@@ -59,8 +59,9 @@ class Evaluate(SimulationOptions, RuleOptions):
         )
         if self.json is not None:
             evaluation.save(self.json)
-            runs = " ".join(map(str, self.runs)) or "RUN"
-            print(f"next: ucfrec report {runs} --results {self.json} --out report.html")
+            runs = shlex.join(map(str, self.runs)) or "RUN"
+            file = shlex.quote(str(self.json))
+            print(f"next: ucfrec report {runs} --results {file} --out report.html")
 
 
 class Collect(SimulationOptions):
@@ -80,26 +81,13 @@ class Collect(SimulationOptions):
         environment = self.make_environment(self.env)
         simulator = environment.simulator()
         behavior = self.behavior or simulator.logging_behavior
-        if behavior not in simulator.behaviors:
-            names = ", ".join(simulator.behaviors)
-            raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {names}")
-        env = simulator.started(256, environment.folder)
-        played = collect(
-            simulator,
-            env,
-            simulator.behaviors[behavior](env, self.seed),
-            self.sessions,
-            self.seed,
-            self.out,
-            env_name=environment.title,
-            behavior=behavior,
-        )
+        env, actor = environment.start(256, behavior, self.seed)
+        named = {"env_name": environment.title, "behavior": behavior}
+        played = collect(simulator, env, actor, self.sessions, self.seed, self.out, **named)
         size = (env.single_observation_space.shape or (0,))[0]
-        observation = (
-            f"observation of {size} numbers"
-            if size
-            else "no observation: states come from the items shown and their rewards"
-        )
+        observation = f"observation of {size} numbers"
+        if not size:
+            observation = "no observation: states come from the items shown and their rewards"
         print(
             f"{self.out}: {self.sessions} sessions of {behavior}, {int(played.lengths.sum())} "
             f"steps, mean return {played.returns.mean():.3f}; reward column {simulator.feedback}; "

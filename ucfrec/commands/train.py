@@ -2,14 +2,17 @@
 `screen` choose them and columns."""
 
 import inspect
+import json
 import shutil
 import textwrap
 import warnings
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table
+from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table, read_docstrings
 from ucfrec.errors import InputError, InputNote
 from ucfrec.policies.registry import policy_names
 
@@ -101,13 +104,14 @@ class Train(TrainingOptions):
         if (self.out / REFIT / RUN).exists():
             whole = read_record(self.out / REFIT)
             print(f"refit         {whole.train_steps:,} rows, all of the store")
+        run = quote(str(self.out))
         print(f"\nrun: {self.out} (TensorBoard can open it)\nmodel card: {self.out / CARD}")
         if record.rule is None:
-            print(f"next: ucfrec evaluate {self.out} --env NAME, in a simulator of these actions")
+            print(f"next: ucfrec evaluate {run} --env NAME, in a simulator of these actions")
         else:
             print(
-                f"next: ucfrec ope {self.out}, its value on the test split of the store\n"
-                f"      ucfrec recommend {self.out} LOGS --out FILE, the next items of every user"
+                f"next: ucfrec ope {run}, its value on the test split of the store\n"
+                f"      ucfrec recommend {run} LOGS --out FILE, the next items of every user"
             )
 
 
@@ -181,8 +185,8 @@ class Tune(Table):
             f"\n{self.metric} {study.best_value:.6g} in trial {best.number}, of "
             f"{len(list_finished(study))} trials; selected on validation rows\n"
             f"settings: {self.out / BEST_TOML}\nall trials: {self.out / PAGE}\n"
-            f"next: ucfrec ope {self.out / BEST}, its value on the test split, which no trial has "
-            "seen"
+            f"next: ucfrec ope {quote(str(self.out / BEST))}, its value on the test split, which "
+            "no trial has seen"
         )
 
 
@@ -225,7 +229,7 @@ class Settings(Table):
 def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, one section per table."""
     from ucfrec.runs.config import TABLES, resolve_config
-    from ucfrec.settings import describe
+    from ucfrec.settings import allowed_values
 
     config, width = resolve_config(policy), min(width, _WIDEST)
     text = textwrap.wrap(
@@ -234,23 +238,18 @@ def settings_text(policy: str, width: int) -> str:
         width,
     )
     for name in TABLES:
-        table = getattr(config, name)
+        table, indent = getattr(config, name), " " * 6
+        classes = type(table).__mro__[:-1]  # the last one is object
         summary = inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
         text += ["", *textwrap.wrap(f"[{name}]  {summary}", width)]
-        for setting in describe(name, table):
-            value = _format_toml(setting.value)
-            text.append(f"  {setting.key:<26}  {value:<22}  {setting.allowed}")
-            indent = " " * 6
-            text += textwrap.wrap(
-                setting.meaning, width, initial_indent=indent, subsequent_indent=indent
+        for field in (field.name for field in fields(table)):
+            texts = (
+                read_docstrings(cls.__module__).get(f"{cls.__name__}.{field}", ("", ""))[0]
+                for cls in classes
             )
+            meaning, value = next(filter(None, texts), ""), getattr(table, field)
+            words = value if isinstance(value, str) else json.dumps(value)
+            words = "unset" if value is None else words
+            text.append(f"  {f'{name}.{field}':<26}  {words:<22}  {allowed_values(table, field)}")
+            text += textwrap.wrap(meaning, width, initial_indent=indent, subsequent_indent=indent)
     return "\n".join(text)
-
-
-def _format_toml(value: Any) -> str:
-    """A value as `--set` takes it; "unset" for None."""
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_format_toml, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "unset" if value is None else str(value)

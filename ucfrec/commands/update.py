@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE, Table
@@ -23,7 +24,7 @@ class Join(LogOptions, Exposures):
     within: Annotated[str, "TIME"]
     """Longest time from exposure to feedback: 90s, 30m, 2h, 1d."""
     out: Annotated[Path, OUTPUT]
-    """Parquet log to write."""
+    """Parquet or CSV log to write."""
 
     def execute(self) -> None:
         """Print what was matched."""
@@ -77,10 +78,11 @@ class Update(LogOptions, RunArgument):
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        run = self.run
-        if not (run / RUN).is_file() and (current := promoted(run)) is not None:
-            run = current.run(run)
+        pointer = None if (self.run / RUN).is_file() else promoted(self.run)
+        run = self.run if pointer is None else pointer.run(self.run)
         old = TrainedPolicy.load(run)
+        if pointer is not None:
+            pointer.require_same(old)
         files, mapping = self.find_logs(self.logs, old, [self.out])
         append = AppendOptions(
             window_ms=None if self.window is None else read_duration("--window", self.window),
@@ -113,7 +115,7 @@ class Update(LogOptions, RunArgument):
         if update.verdict.result == "worse":
             print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
         else:
-            print(f"next: ucfrec promote {self.out}, if `serve` follows its folder")
+            print(f"next: ucfrec promote {quote(str(self.out))}, if `serve` follows its folder")
 
 
 class Compare(Table):
@@ -140,12 +142,7 @@ class Compare(Table):
         from ucfrec.files.atomic import write_json
         from ucfrec.off_policy.ab_test import compare_arms
 
-        arms = None
-        if self.arms is not None:
-            first, _, second = (part.strip() for part in self.arms.partition(","))
-            if not (first and second):
-                raise InputError(f"--arms {self.arms}: write two names, A,B")
-            arms = first, second
+        arms = None if self.arms is None else [arm.strip() for arm in self.arms.split(",")]
         if self.expected is not None and not self.expected > 0:
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
         result = compare_arms(self.logs, self.column, arms, self.expected, self.memory_limit)

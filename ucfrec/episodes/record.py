@@ -81,6 +81,8 @@ class Source(Entry):
     """Steps without a propensity; None if the logs have none at all."""
     features: tuple[Text, ...] = ()
     """Id columns whose users or items had feature tables."""
+    feature_tables: dict[Text, dict[Text, dict[Text, Count]]] = Field(default_factory=dict)
+    """By id column: the feature tables, by file, and how many columns of which kind they had."""
     time_range_ms: tuple[Milliseconds, Milliseconds] | None = None
     """First and last time."""
     split_times_ms: tuple[Milliseconds, Milliseconds] | None = None

@@ -143,21 +143,16 @@ def _lists(rows: Array) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())
 
 
-def collect_store(
-    environment: Environment, folder: Path, sessions: int, seed: int, behavior: str | None = None
-) -> Path:
-    """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
-    `behavior` is a built-in policy of the simulator; None for its `logging_behavior`.
-    """
+def collect_store(environment: Environment, folder: Path, sessions: int, seed: int) -> Path:
+    """Collect logs of the `logging_behavior` in `folder/logs` and prepare `folder/store`; existing
+    folders are reused."""
     logs, store = folder / "logs", folder / "store"
     simulator = environment.simulator()
     if not logs.exists():
-        env = simulator.started(256, environment.folder)
-        chosen = behavior or simulator.logging_behavior
-        actor = simulator.behaviors[chosen](env, seed)
-        collect(
-            simulator, env, actor, sessions, seed, logs, env_name=environment.title, behavior=chosen
-        )
+        behavior = simulator.logging_behavior
+        env, actor = environment.start(256, behavior, seed)
+        named = {"env_name": environment.title, "behavior": behavior}
+        collect(simulator, env, actor, sessions, seed, logs, **named)
     if not store.exists():
         items = logs / "items.parquet"
         # Collecting logs needs no DuckDB.

@@ -42,12 +42,7 @@ def evaluate_behavior(
 ) -> ResultRow:
     """Result row of an environment's built-in policy (`random`, `optimal`, …); InputError if it has
     none of that name. The seed is that of the environments and of the policy."""
-    simulator = environment.simulator()
-    if behavior not in simulator.behaviors:
-        names = ", ".join(simulator.behaviors)
-        raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {names}")
-    env = simulator.started(min(episodes, SIDE_BY_SIDE), environment.folder)
-    actor = simulator.behaviors[behavior](env, seed)
+    env, actor = environment.start(min(episodes, SIDE_BY_SIDE), behavior, seed)
     name = {"method": behavior, "policy": behavior}
     return _row(environment, name, env, actor, episodes, seed)
 

@@ -111,8 +111,8 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
 
     def __init__(self, env_id: str, observe: tuple[str, ...]) -> None:
         try:
-            super().__init__(gymnasium.make(env_id, disable_env_checker=True))
-        except (gymnasium.error.Error, ImportError) as error:
+            super().__init__(_make(env_id))
+        except Exception as error:  # the module of an environment may raise anything
             raise InputError(
                 f"gymnasium:{env_id} cannot be made ({error}); give an identifier that Gymnasium "
                 "knows, or with the module that registers it, as in gymnasium:MODULE:ID"
@@ -147,6 +147,15 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
             for key, space in self._observed
         ]
         return np.concatenate(parts).astype(np.float32)
+
+
+def _make(env_id: str) -> gymnasium.Env[Any, Any]:
+    try:
+        return gymnasium.make(env_id, disable_env_checker=True)
+    except gymnasium.error.NamespaceNotFound:
+        # Most packages register their environments, as NAMESPACE/NAME, when they are imported.
+        module = env_id.partition("/")[0]
+        return gymnasium.make(f"{module}:{env_id}", disable_env_checker=True)
 
 
 def _actions(

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import best_items
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore, UserRows
@@ -64,7 +65,7 @@ class LikedExpression:
         source = Path(_ROWS)
         types = tuple((name, "DOUBLE") for name in self._names.values())
         table = FrameTable((source,), types)
-        with engine((), None) as connection, explain_errors(connection, (table,), source):
+        with engine((), None) as connection, explain_errors(connection, (table,)):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
             sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":
@@ -169,8 +170,8 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
             scores[batch.left_out] = -torch.inf
         if (offer := store.offer(batch.episodes, batch.steps)) is not None:
             scores = scores.masked_fill(~offer.mask(), -torch.inf)
-        best, top = scores.topk(k, dim=1)
-        listed_items = top.masked_fill(torch.isneginf(best), -1)
+        top = best_items(scores, k)
+        listed_items = top.masked_fill(torch.isneginf(scores.gather(1, top)), -1)
         parts.append(listed_items.expand(len(numbers), k).numpy())
     return Ranked(_first_scores(ranker, later, at_once), np.concatenate(parts))
 

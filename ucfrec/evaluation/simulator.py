@@ -100,6 +100,18 @@ class Environment:
         features = f" --item-features {self.item_features}" if self.item_features else ""
         return self.name + observe + features
 
+    def start(
+        self, sessions: int, behavior: str, seed: int
+    ) -> "tuple[VectorEnv[Any, Any, Any], Actor]":
+        """Parallel sessions and a built-in policy for them; InputError if there is none of that
+        name."""
+        simulator = self.simulator()
+        if behavior not in simulator.behaviors:
+            names = ", ".join(simulator.behaviors)
+            raise InputError(f"{self.name} has no behavior {behavior!r}; it has {names}")
+        env = simulator.started(sessions, self.folder)
+        return env, simulator.behaviors[behavior](env, seed)
+
     def simulator(self) -> Simulator:
         """Load the simulator plugin, or make the one of a Gymnasium environment; InputError if it
         is not installed, or takes no `observe` and `item_features`."""

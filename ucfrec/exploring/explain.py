@@ -168,7 +168,7 @@ def _find_excluded(
         excluded["the user has seen it"] = trained.items.numbers(user.seen_ids)
     # Of several reasons, the last one here.
     reasons = {n: words for words, numbers in excluded.items() for n in numbers.tolist()}
-    order = torch.argsort(scores, descending=True).tolist()
+    order = torch.argsort(scores, descending=True, stable=True).tolist()
     ids = trained.items.ids
     ranked = [(rank, number) for rank, number in enumerate(order, start=1) if number in reasons]
     return [Excluded(ids[number], rank, reasons[number]) for rank, number in ranked[:_EXCLUDED]]

@@ -24,7 +24,6 @@ from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import render_report, template
 from ucfrec.reporting.results import find_quoted, read_evidence
-from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PACKAGE: Final = "ucfrec.exploring"
@@ -58,13 +57,23 @@ class Explorer:
             results: files of `ucfrec ope --json` and `ucfrec evaluate --json`, for the report.
 
         Raises:
-            InputError: a policy's actions are vectors, or there are none or more than two.
+            InputError: a policy's actions are vectors, there are none or more than two, or a file
+                of results cannot be used.
         """
         if not 1 <= len(runs) <= 2:
             raise InputError(f"{len(runs)} runs are named; name one, or two to compare")
         for trained in runs:
             trained.item_scorer()
         self.runs, self._results = tuple(runs), tuple(results)
+        self.values = sorted(
+            (
+                (row.target_return, estimates.name, row)
+                for estimates in read_evidence(results)[1]
+                if (row := find_quoted(estimates.rows)) and row.target_return is not None
+            ),
+            key=lambda value: value[:2],
+        )
+        """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
         rows = [] if features is None else features.to_pylist()
         self._features = {str(row[schema.ITEM_ID]): row for row in rows}
 
@@ -74,7 +83,7 @@ class Explorer:
         for run in self.runs:
             card, text = run.folder / CARD, "There is no model card."
             if card.exists():
-                text = card.read_text(encoding="utf-8")
+                text = card.read_text(encoding="utf-8", errors="backslashreplace")
             runs.append((run.folder.name, run, text))
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
@@ -91,16 +100,6 @@ class Explorer:
         return template(_PACKAGE, "explore_results.html").render(**self._fill(fields))
 
     @cached_property
-    def values(self) -> list[tuple[float, str, ResultRow]]:
-        """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
-        values = []
-        for estimates in read_evidence(self._results)[1]:
-            row = find_quoted(estimates.rows)
-            if row is not None and row.target_return is not None:
-                values.append((row.target_return, estimates.name, row))
-        return sorted(values, key=lambda value: value[:2])
-
-    @cached_property
     def values_chart(self) -> Chart | None:
         """The values as one curve per policy; None with fewer than two targets."""
         curves: dict[str, dict[float, float]] = {}
@@ -108,7 +107,7 @@ class Explorer:
             curves.setdefault(row.policy, {})[target] = row.value
         if max(map(len, curves.values()), default=0) < 2:
             return None
-        lines = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
+        lines = [(name, style, curves[name]) for style, name in enumerate(curves)]
         return line_chart("Off-policy value against the target return", "target return", lines)
 
     @cached_property
@@ -129,11 +128,9 @@ class Explorer:
                     lists.append((trained.folder.name, str(rule), explained))
         except InputError as fault:
             lists, error = [], str(fault)
-        ids, widest = [], 0.0
-        for _, _, explained in lists:
-            ids.append({str(card.item_id) for card in explained.cards})
-            for card in explained.cards:
-                widest = max(widest, max(map(abs, card.parts.values())))
+        ids = [{str(card.item_id) for card in explained.cards} for *_, explained in lists]
+        cards = (card for *_, explained in lists for card in explained.cards)
+        widest = max((abs(part) for card in cards for part in card.parts.values()), default=0.0)
         return {
             "lists": lists,
             "error": error,
@@ -209,10 +206,11 @@ def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRul
     """The run's own rule, or that of the sliders."""
     if fields.get("custom") is None:
         return trained.rule
-    changes: dict[str, Any] = {}
-    for name in ("target", "reward_weight", "temperature"):
-        if name in fields:
-            changes[name] = _read_number(fields, name, -1e12, 1e12)
+    changes: dict[str, Any] = {
+        name: _read_number(fields, name, -1e12, 1e12)
+        for name in ("target", "reward_weight", "temperature")
+        if name in fields
+    }
     if "tag_window" in fields:
         changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 10))
     return replace(trained.rule, **changes)

@@ -1,20 +1,21 @@
-"""What untrusted Parquet and gzip files may claim, columns of ids, and writing frames."""
+"""What untrusted Parquet and gzip files may claim, columns of ids, and writing tables."""
 
 import gzip
 import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ucfrec.arrays import Array
-from ucfrec.errors import InputError, one_line
+from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, require_file
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 _FEW_ROWS: Final = 1_000_000
 _ROWS_PER_BYTE: Final = 10
@@ -85,7 +86,7 @@ def read_ids(path: Path, column: str) -> Array:
     except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
         if _NO_THREAD in str(error):
             raise MemoryError(str(error)) from None
-        what = f"is damaged or has no column {column!r} ({one_line(str(error)):.200})"
+        what = f"is damaged or has no column {column!r} ({error})"
         raise InputError(f"{path} {what}; {_REMEDY}") from None
     integers = pa.types.is_integer(ids.type)
     texts = pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)
@@ -95,15 +96,42 @@ def read_ids(path: Path, column: str) -> Array:
     return np.asarray(ids, dtype=np.int64 if integers else None)
 
 
+def require_table_names(paths: Iterable[Path | None]) -> None:
+    """Check that tables to write end in .parquet, .csv, or nothing, for Parquet; InputError if
+    not."""
+    for path in paths:
+        if path is not None and path.suffix.lower() not in ("", ".parquet", ".csv"):
+            raise InputError(
+                f"{path}: tables are written as Parquet or CSV; name a file that ends in .parquet "
+                "or .csv"
+            )
+
+
+def table_writer(scratch: Path, out: Path, schema: "pa.Schema") -> Any:
+    """A writer of tables to the scratch of a file, of the kind that the file's name says."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from pyarrow import csv
+
+    require_table_names([out])
+    if out.suffix.lower() != ".csv":
+        return pq.ParquetWriter(scratch, schema)
+    if nested := [field.name for field in schema if pa.types.is_nested(field.type)]:
+        raise InputError(
+            f"{out}: CSV has no lists, as in the column {nested[0]}; name a file that ends in "
+            ".parquet"
+        )
+    return csv.CSVWriter(scratch, schema)
+
+
 def write_frames(
     out: Path, frames: "Iterable[pd.DataFrame]", metadata: Mapping[str, str] | None = None
 ) -> int:
-    """Write `frames` one after the other as a single Parquet file, atomically; returns its rows.
+    """Write `frames` one after the other as a single file, atomically; returns its rows.
 
-    `metadata` is added to that of the schema.
+    `metadata` is added to that of the schema, which CSV does not have.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     rows, writer = 0, None
     with atomic_file(out) as scratch:
@@ -111,7 +139,7 @@ def write_frames(
             table = pa.Table.from_pandas(frame, preserve_index=False)
             entries = {**(table.schema.metadata or {}), **(metadata or {})}
             table = table.replace_schema_metadata(entries)
-            writer = writer or pq.ParquetWriter(scratch, table.schema)
+            writer = writer or table_writer(scratch, out, table.schema)
             writer.write_table(table)
             rows += len(frame)
         if writer is not None:

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import gettempdir
 from typing import Any, Final
 
-from ucfrec.errors import InputError, one_line
+from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 
 _URI: Final = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://.+")
@@ -110,8 +110,7 @@ def _errors_of(uri: str) -> Iterator[None]:
     except InputError:
         raise
     except (ImportError, ValueError, OSError) as error:
-        what = one_line(str(error))
-        raise InputError(f"{uri} cannot be used ({what:.300}); check the address") from None
+        raise InputError(f"{uri} cannot be used ({error}); check the address") from None
 
 
 def _open(uri: str) -> tuple[Any, str]:

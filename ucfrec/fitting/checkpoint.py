@@ -5,9 +5,10 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import torch
+from pydantic import Field, TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -21,6 +22,7 @@ METRICS: Final = "metrics.jsonl"
 _STEP: Final = "step"
 _LARGEST_STEP: Final = 2**53
 """The largest range of integers that floats represent exactly."""
+_LINE: Final = TypeAdapter(dict[str, Annotated[float, Field(strict=True)] | None])
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
@@ -160,32 +162,15 @@ def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
     scalars: dict[str, dict[int, float]] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            step, values = _parse_line(line)
-        except ValueError as error:
+            values = _LINE.validate_json(line)
+            step = values.pop(_STEP)
+            if step is None or not 0 <= step <= _LARGEST_STEP or step % 1:
+                raise ValueError
+        except (ValueError, KeyError):
             raise InputError(
-                f"{path}, line {number}, {error}; delete the line, or restore the file"
+                f"{path}, line {number}, is not a JSON object of numbers with a whole number of 0 "
+                f"or more as {_STEP!r}; delete the line, or restore the file"
             ) from None
         for name, value in values.items():
-            scalars.setdefault(name, {})[step] = value
+            scalars.setdefault(name, {})[int(step)] = math.nan if value is None else value
     return {name: dict(sorted(curve.items())) for name, curve in scalars.items()}
-
-
-def _parse_line(line: bytes) -> tuple[int, dict[str, float]]:
-    """Step and scalars of a line; a ValueError says what is wrong with it."""
-    try:
-        values = json.loads(line)
-    except (ValueError, RecursionError):
-        raise ValueError("is not JSON") from None
-    if not isinstance(values, dict):
-        raise ValueError("is not a JSON object")
-    step = values.pop(_STEP, None)
-    if type(step) is not int or not 0 <= step <= _LARGEST_STEP:
-        raise ValueError(f"has no whole number of 0 or more as {_STEP!r}")
-    for name, value in values.items():
-        if value is not None and type(value) not in (int, float):
-            raise ValueError(f"has no number as {name!r}")
-        try:
-            values[name] = math.nan if value is None else float(value)
-        except OverflowError:
-            raise ValueError(f"has too large a number as {name!r}") from None
-    return step, values

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError, warn_user
@@ -28,6 +28,7 @@ from ucfrec.logs.expressions import Expression
 from ucfrec.logs.features import encode_ids, note_lacking
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, read_log
+from ucfrec.logs.rows import FAULTY
 from ucfrec.logs.sessions import ID_TABLES, write_ids, write_steps
 from ucfrec.logs.summary import note_unknown
 from ucfrec.logs.typed import TypedLog
@@ -37,6 +38,9 @@ SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
 _FILL: Final = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
+_DENSER: Final = 20
+_LATEST: Final = 210_000
+"""Number of the latest rows of a log among which its end is looked for."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,10 @@ def append_logs(
 ) -> dict[str, Any]:
     """Write a store of the old episodes and of those of new logs, atomically.
 
-    Old shards are hard links where the file system allows it. Rows that are not newer than the last
-    row of the store are left out and counted as `clock_out_of_range`, so that logs which are given
-    twice count once. A session that goes on in the new logs is two episodes.
+    Old shards are hard links where the file system allows it. Logs that are given twice count once:
+    rows that are not after the end of the store (`find_end`) are left out and counted as
+    `clock_out_of_range`; later ones whose user, item and time a row of the store has are left out
+    as duplicates. A session that goes on in the new logs is two episodes.
 
     Args:
         store: folder of a store of items that `prepare` or this function wrote.
@@ -83,10 +88,12 @@ def append_logs(
     made_of = _describe_inputs(old, files, mapping, options)
     if (out / StoreRecord.FILE).is_file():
         return _read_report(out, made_of)
-    origin, last = str(store / StoreRecord.FILE), old.source.time_range_ms[1]
+    origin = str(store / StoreRecord.FILE)
+    shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
+    end = find_end(np.concatenate([shard.latest_times() for shard in shards]))
     mapping = replace(
         mapping.over(LogMapping.of_source(old.source, origin)),
-        earliest=datetime.fromtimestamp((last + 1) / 1000, UTC).isoformat(),
+        earliest=datetime.fromtimestamp((end + 1) / 1000, UTC).isoformat(),
     )
     if schema.OBSERVATION not in old.columns:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
@@ -101,13 +108,85 @@ def append_logs(
     )
     if old.source.session_gap_ms is not None:
         reading = replace(reading, gap_minutes=old.source.session_gap_ms / 60_000)
+    late = _rows_after(end, store, shards) if any((s.times > end).any() for s in shards) else None
     with (
         atomic_folder(out) as folder,
-        read_log(files, mapping, reading, out.parent, store, grows=True) as log,
+        read_log(files, mapping, reading, out.parent, store, grows=True, held=late) as log,
     ):
         _require_held_out(log.rows.log.name, log.report)
+        if late is not None:
+            _note_late(log.rows.log, store, late, end)
+        if options.window_ms is not None:
+            _expire(shards, log.rows.log, options.window_ms)
         counts = _survey_ids(log, mapping, store, old)
-        return _write(store, old, log, folder, options.window_ms, counts, made_of)
+        return _write(store, old, shards, log, folder, counts, made_of)
+
+
+def find_end(times: IntArray) -> int:
+    """When a log ends, of its latest times in any order: the last one, or one before it if the
+    clocks of a few rows were fast.
+
+    The last rows are such if the rows before them, up to `_DENSER` times as many, are more than
+    `_DENSER` times as dense; of several numbers of last rows, the one where they are densest
+    counts. Example: a row every 30 seconds and a last one that is more than 10 minutes later.
+    """
+    latest, last = np.sort(times)[::-1], len(times) - 1
+    late = np.arange(1, max(len(times) // (_DENSER + 1), 1) + 1)
+    ends, begins = (np.minimum(late * factor, last) for factor in (1, _DENSER + 1))
+    pauses, spans = latest[0] - latest[ends], latest[ends] - latest[begins]
+    densities = (pauses / late) * (begins - ends) / np.maximum(spans, 1)
+    best = int(densities.argmax())
+    return int(latest[ends[best]] if densities[best] > _DENSER else latest[0])
+
+
+def _rows_after(end: int, store: Path, shards: Sequence["_Shard"]) -> pa.Table:
+    """User and item, as text, and time of the rows of a store after its end."""
+
+    def join(name: str) -> Array:
+        return np.concatenate([shard.load(name, shard.times > end) for shard in shards])
+
+    columns: dict[str, Any] = {schema.TIMESTAMP: join(schema.TIMESTAMP)}
+    for (name, _, file), column in zip(ID_TABLES, (schema.USER, schema.ITEM), strict=True):
+        numbers, ids = join(column), pq.read_table(store / file, columns=[name])[name]
+        columns[name] = ids.take(pa.array(numbers, mask=numbers < 0)).cast(pa.string())
+    return pa.table(columns)
+
+
+def _note_late(log: TypedLog, store: Path, late: pa.Table, end: int) -> None:
+    """Warn of rows of a store after its end, if new rows come before some of them."""
+    last = late[schema.TIMESTAMP].to_numpy().max()
+    (count,) = log.one(
+        f"SELECT count(*) FROM {FAULTY} WHERE fault = 0 AND {schema.TIMESTAMP} < {last}"
+    )
+    if count:
+        warn_user(
+            f"{store}: {_describe_late(late, end)}; {count:,} new rows between are added. Correct "
+            "the clocks, prepare all logs again and train"
+        )
+
+
+def _expire(shards: Sequence["_Shard"], log: TypedLog, window_ms: int) -> None:
+    """Leave out the sessions that ended longer before the end of the new log."""
+    columns = ", ".join((schema.TIMESTAMP, *(name for name, _, _ in ID_TABLES)))
+    latest = log.connection.sql(
+        f"SELECT {columns} FROM {FAULTY} WHERE fault = 0 ORDER BY {schema.TIMESTAMP} DESC "
+        f"LIMIT {_LATEST}"
+    ).to_arrow_table()
+    times = latest[schema.TIMESTAMP].to_numpy()
+    end = find_end(times)
+    if end < times[0]:
+        late = latest.filter(times > end)
+        warn_user(f"{log.name}: {_describe_late(late, end)}; the window ends there, too")
+    for shard in shards:
+        shard.stays = shard.times[shard.offsets[1:] - 1] >= end - window_ms
+
+
+def _describe_late(late: pa.Table, end: int) -> str:
+    latest = late.sort_by([(schema.TIMESTAMP, "descending")]).slice(0, 3).to_pylist()
+    return (
+        f"{late.num_rows:,} row(s) are after {datetime.fromtimestamp(end / 1000, UTC)}, where the "
+        f"log seems to end, as if clocks were fast (the latest: {latest})"
+    )
 
 
 def _describe_inputs(
@@ -184,29 +263,36 @@ def _survey_ids(
 
 
 class _Shard:
-    """A shard of the old store: `lengths` (E,) of its episodes, and which of them `stays` (E,)."""
+    """A shard of the old store: `lengths` (E,) of its episodes, which of them `stays` (E,), and the
+    `times` of its steps (S,)."""
 
-    def __init__(self, folder: Path, cut_ms: float) -> None:
-        """Episodes that ended before `cut_ms` are left out."""
-        offsets = np.load(folder / f"{schema.OFFSETS}.npy")
-        times = np.load(folder / f"{schema.TIMESTAMP}.npy", mmap_mode="r")
-        self.folder, self.lengths = folder, np.diff(offsets)
-        self.stays: BoolArray = np.asarray(times[offsets[1:] - 1] >= cut_ms)
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.offsets = folder, np.load(folder / f"{schema.OFFSETS}.npy")
+        self.lengths = np.diff(self.offsets)
+        self.times: IntArray = np.load(folder / f"{schema.TIMESTAMP}.npy", mmap_mode="r")
+        self.stays: BoolArray = np.ones(len(self.lengths), dtype=bool)
 
-    def load(self, name: str, episodes: BoolArray) -> Array:
-        """A column at every step of some episodes (E,), even if it is one of episodes."""
+    def latest_times(self) -> IntArray:
+        """The last `_LATEST` times."""
+        return np.partition(self.times, -min(_LATEST, len(self.times)))[-_LATEST:]
+
+    def load(self, name: str, rows: BoolArray) -> Array:
+        """A column at the steps of some episodes (E,) or at some steps (S,), even if it is one of
+        episodes."""
         values = np.load(self.folder / f"{name}.npy", mmap_mode="r")
+        if len(rows) == len(self.lengths):
+            rows = np.repeat(rows, self.lengths)
         if name in schema.EPISODE_DTYPES:
-            return np.repeat(values[episodes], self.lengths[episodes])
-        return np.asarray(values[np.repeat(episodes, self.lengths)])
+            values = np.repeat(values, self.lengths)
+        return np.asarray(values[rows])
 
 
 def _write(
     store: Path,
     old: StoreRecord,
+    shards: Sequence[_Shard],
     log: PreparedLog,
     folder: Path,
-    window_ms: int | None,
     counts: Mapping[str, int],
     made_of: Mapping[str, Any],
 ) -> dict[str, Any]:
@@ -214,8 +300,6 @@ def _write(
     from ucfrec.logs.items import write_grown_states  # imports scipy and torch
 
     typed = log.rows.log
-    cut_ms = -np.inf if window_ms is None else log.report["time_range_ms"][1] - window_ms
-    shards = [_Shard(store / f"shard-{n:05d}", cut_ms) for n in range(old.n_shards)]
     left = [shard for shard in shards if shard.stays.any()]
     added = [name for name in _FILL if name in typed.columns and name not in old.columns]
     if schema.OBSERVATION in old.columns and schema.OBSERVATION not in typed.columns:
@@ -305,19 +389,17 @@ def _merge_records(
     dropped = dict(old.source.dropped)
     for reason, rows in report["dropped"].items():
         dropped[reason] = dropped.get(reason, 0) + rows
-    first, last = report["time_range_ms"]
-    if report["expired_steps"]:
-        times = (int(shard.load(schema.TIMESTAMP, shard.stays).min()) for shard in left)
-        first = min(times, default=first)
-    elif old.source.time_range_ms is not None:
-        first = old.source.time_range_ms[0]
+    times = [*report["time_range_ms"]]
+    for shard in left:
+        of_shard = shard.load(schema.TIMESTAMP, shard.stays)
+        times += [int(of_shard.min()), int(of_shard.max())]
     source = {
         **old.source.model_dump(),
         "files": [*old.source.files, *map(str, report["files"])],
         "rows_read": (old.source.rows_read or 0) + report["rows_read"],
         "dropped": dropped,
         "steps": steps + new.n_steps,
-        "time_range_ms": [first, last],
+        "time_range_ms": [min(times), max(times)],
         "split_times_ms": report["split_times_ms"],
         **origin,
     }

@@ -8,7 +8,7 @@ columns that a run remembers of its training log and the plain ones.
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -23,7 +23,15 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.expressions import NotScalarError, cast_truth_values, columns_of, refusal
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
-from ucfrec.logs.tables import Table, fault_of_line, first_line, glob_pattern, quote, quote_name
+from ucfrec.logs.tables import (
+    EXPOSED,
+    Table,
+    fault_of_line,
+    first_line,
+    glob_pattern,
+    quote,
+    quote_name,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -40,7 +48,10 @@ _CLOSED: Final = {
     # Otherwise SQL could read any Python variable as a table.
     "python_enable_replacements": False,
 }
+_OF_JOIN: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.PROPENSITY)
+"""Log columns that logs of `join` have."""
 _NAME: Final = re.compile(r"[^\W\d]\w*")
+_OF_ENGINE: Final = re.compile(r"[A-Z][A-Za-z ]+ Error: ")
 _DISK_FULL: Final = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
 """In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
@@ -226,21 +237,29 @@ def wrong_type(table: Table, what: str, expression: str, kind: str, remedy: str)
 
 @contextmanager
 def explain_errors(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path | None = None
 ) -> Iterator[None]:
-    """Turn errors of files, memory and the disk of `folder` in the block into `InputError`: the
-    limit or disk is exhausted, or a file or value cannot be read."""
+    """Turn errors of files, memory and disks in the block into `InputError`: the limit or a disk is
+    exhausted, or a file or value cannot be read. What is not the engine's is written to `folder`;
+    None for the engine's folder."""
     try:
         yield
     except (OSError, SafetensorError, duckdb.Error) as error:
+        # Of rows that are read through Arrow, the engine's errors are OSError.
+        of_engine = isinstance(error, duckdb.Error) or _OF_ENGINE.match(str(error))
         if any(phrase in str(error) for phrase in _DISK_FULL):
+            if of_engine or folder is None:
+                with suppress(duckdb.Error):
+                    # A cursor, as the result that failed may still be open.
+                    setting = connection.cursor().sql("SELECT current_setting('temp_directory')")
+                    folder = Path(setting.fetchall()[0][0]).parent.parent
             raise InputError(
                 f"no space left on the disk of {folder}; free space or write elsewhere"
             ) from None
+        if str(error).startswith("Out of Memory"):
+            raise InputError(f"{first_line(error)}; raise memory_limit") from None
         if not isinstance(error, duckdb.Error):
             raise
-        if isinstance(error, duckdb.OutOfMemoryException):
-            raise InputError(f"{first_line(error)}; raise memory_limit") from None
         raise _find_fault(connection, tables, error) or error from None
 
 
@@ -272,19 +291,27 @@ def settle_mapping(
 
     What is mapped counts. Otherwise a remembered column, condition or reward counts if all files
     have the columns that it needs; if not, the plain name does, and no condition. The column
-    `reward` stands for the reward of a log whose columns were mapped. Raises InputError if a file
-    has neither the remembered column nor the plain one that it must have.
+    `reward` stands for the reward of a log whose columns were mapped. What a log of `join` lacks is
+    not mapped. Raises InputError if a file has neither the remembered column nor the plain one that
+    it must have.
     """
+    joined = [table for table in tables if table.of_exposures]
+    others = [table for table in tables if not table.of_exposures]
+    columns = {
+        name: text
+        for name, text in mapping.columns.items()
+        if name in _OF_JOIN or not text or _find_lacking(connection, joined, text) is None
+    }
     remembered = mapping.remembered
     if remembered is None:
-        return mapping, reward
-    columns = dict(mapping.columns)
+        return replace(mapping, columns=columns), reward
     for name, text in remembered.columns.items():
-        if name in columns:
+        having = others if name in _OF_JOIN else tables
+        if name in mapping.columns or not having:
             continue
-        if not text or _find_lacking(connection, tables, text) is None:
+        if not text or _find_lacking(connection, having, text) is None:
             columns[name] = text
-        elif name in KEY_COLUMNS and (table := _find_lacking(connection, tables, name)):
+        elif name in KEY_COLUMNS and (table := _find_lacking(connection, having, name)):
             raise InputError(
                 f"{table.files[0]} has neither {str(text)!r}, which is {name} in the log that the "
                 f"run was trained on, nor a column {name!r}; map it with --column {name}=..."
@@ -310,14 +337,28 @@ def _find_lacking(
     """The first table that lacks a column which a name or expression reads; None if none does."""
     for table in tables:
         names = {name.casefold() for name in table.columns}
-        if expression.casefold() in names:
-            continue
-        if expression.isidentifier():
-            return table
-        try:
-            reads = columns_of(connection, expression)
-        except (duckdb.Error, NotScalarError):
-            continue  # it is refused where it is bound, with the reason
-        if not {name.casefold() for name in reads} <= names:
+        if expression.casefold() not in names and not _read_names(connection, expression) <= names:
             return table
     return None
+
+
+def _read_names(connection: duckdb.DuckDBPyConnection, expression: str) -> set[str]:
+    """Columns that a name or expression reads, in lower case; none of one that cannot be bound."""
+    if expression.isidentifier():
+        return {expression.casefold()}
+    try:
+        return {name.casefold() for name in columns_of(connection, expression)}
+    except (duckdb.Error, NotScalarError):
+        return set()  # it is refused where it is bound, with the reason
+
+
+def text_of_column(
+    connection: duckdb.DuckDBPyConnection, table: Table, mapping: LogMapping, name: str
+) -> str:
+    """The column or expression that a log column is in a table. Those of a log of `join` have the
+    names of `join`, unless what is mapped reads these, such as `timestamp + position`."""
+    text = mapping.columns.get(name) or name
+    if table.of_exposures and name in _OF_JOIN:
+        reads = _read_names(connection, text)
+        return text if reads and reads <= {*_OF_JOIN, *EXPOSED} else name
+    return text

@@ -1,6 +1,7 @@
 """Features of items and users: tables that are read with a log, then sparse matrices."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from ucfrec.logs.sessions import ID_TABLES
 from ucfrec.logs.tables import (
     NOTHING,
     PANDAS_INDEX,
+    WHOLE,
     Table,
     cast_timestamp,
     is_integer,
@@ -35,12 +37,16 @@ if TYPE_CHECKING:
 
     from ucfrec.episodes.offers import Offers
 
+_KINDS: Final = {
+    "DOUBLE": "numbers",
+    "VARCHAR": "categories",
+    "VARCHAR[]": "tags",
+    "FLOAT[]": "vectors",
+}
 CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
-_WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
-"""DuckDB type of reals to the bound below which it holds every whole number."""
 _TIMES: Final = ("available_from", "available_until")
 _MANY_LACKING: Final = 0.2
 """Share of the ids without a row above which a note says so."""
@@ -80,7 +86,7 @@ def load_features(
         rows_of_parts = " UNION ALL ".join(
             _select_rows(part, types, id_type, has_times) for part in parts
         )
-        with explain_errors(connection, opened, opened[0].files[0].parent):
+        with explain_errors(connection, opened):
             connection.execute(
                 f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
             )
@@ -138,6 +144,12 @@ def read_offers(
         older = Offers.load(store / OFFERS).intervals
         intervals = np.hstack([intervals, older[:, ~np.isin(older[0], intervals[0])]])
     return Offers.of(n_items, intervals)
+
+
+def count_features(connection: duckdb.DuckDBPyConnection, name: str) -> dict[str, int]:
+    """How many columns of which kind a table of `load_features` has."""
+    kinds = Counter(kind for _, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:])
+    return {_KINDS[kind]: n for kind, n in kinds.items()}
 
 
 def _read_part(
@@ -255,7 +267,7 @@ def _cast_id(key: str, key_type: str, id_type: str) -> str:
     if is_number(key_type) and not is_integer(key_type):
         # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id, as the
         # file did with whole numbers that its type does not hold.
-        exact = f"AND abs({key}) < {_WHOLE[key_type]}" if key_type in _WHOLE else ""
+        exact = f"AND abs({key}) < {WHOLE[key_type]}" if key_type in WHOLE else ""
         key = f"CASE WHEN {key} = trunc({key}) {exact} THEN TRY_CAST({key} AS HUGEINT) END"
     elif id_type == "BIGINT" and not is_integer(key_type):
         # Text is an integer only if it is written as the integer is: 007 is not 7.

@@ -1,5 +1,6 @@
 """The item history of each user of a log, from files or from a data frame."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -13,10 +14,10 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.errors import InputError, warn_user
+from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors, settle_mapping
-from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
 from ucfrec.logs.tables import Table, quote_name
@@ -35,6 +36,8 @@ _UNREAD: Final = (
     pa.types.is_interval,
     pa.types.is_run_end_encoded,
     pa.types.is_union,
+    lambda kind: str(kind).startswith("extension<pandas."),
+    lambda kind: pa.types.is_dictionary(kind) and pa.types.is_nested(kind.value_type),
 )
 """Types of Arrow that the engine or Parquet lacks."""
 
@@ -181,7 +184,7 @@ def frame_histories(
 ) -> Iterator[Histories]:
     """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
     too."""
-    columns = log_table(frame, HISTORIES)
+    columns = log_table(frame, HISTORIES, mapping, reward)
     with engine((), None) as connection:
         connection.register(HISTORIES, columns)
         relation = connection.table(HISTORIES)
@@ -192,11 +195,13 @@ def frame_histories(
         yield from _read_users(tables, last, duplicates, None)
 
 
-def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
-    """Convert a data frame to Arrow, leaving out, with a note, columns that it cannot hold.
+def log_table(
+    frame: "pd.DataFrame", name: str, mapping: LogMapping, reward: str | None
+) -> pa.Table:
+    """Convert a data frame to Arrow without the columns that it cannot hold.
 
     Raises InputError if `frame` is not a data frame or has no rows, two columns have the same name,
-    or a key column has values of several types, durations or periods.
+    or the mapping or the reward (None for that of the mapping) reads a column that is left out.
     """
     import pandas as pd
 
@@ -212,15 +217,16 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
         raise InputError(
             f"{name}: two columns are called {', '.join(twice)} (case does not count); rename one"
         )
-    columns = {}
+    columns, texts = {}, reward or mapping.reward or schema.REWARD
+    for part in (mapping, mapping.remembered or mapping):
+        mapped = (part.columns.get(n, n) for n in (*KEY_COLUMNS, *OPTIONAL_COLUMNS))
+        texts = " ".join([texts, part.where or "", *mapped])
     for column in frame.columns:
         array = _convert_column(frame[column])
         if not isinstance(array, str):
             columns[str(column)] = array
-        elif column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
+        elif re.search(rf"(?<!\w){re.escape(str(column))}(?!\w)", texts, re.IGNORECASE):
             raise InputError(f"{name}: {column} {array}")
-        else:
-            warn_user(f"{name}: column {column} is left out: it {array}")
     return pa.table(columns)
 
 
@@ -264,9 +270,9 @@ def _read_users(
     tables: LogTables, last: int, duplicates: str, folder: Path | None
 ) -> Iterator[Histories]:
     """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
-    log = open_log(tables, folder or Path(HISTORIES))
+    log = open_log(tables)
     log.require_items()
-    with explain_errors(log.connection, log.tables, folder or Path(HISTORIES)):
+    with explain_errors(log.connection, log.tables):
         rows = sort_rows(log, None, duplicates, folder)
         require_rows(log, rows.count, rows.dropped)
         note_dropped(log.name, rows.dropped, rows.read)

@@ -10,12 +10,13 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
-from ucfrec.files.atomic import atomic_file, require_other_files, scratch_folder
+from ucfrec.files.atomic import atomic_file, require_other_files
+from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.sessions import write_batches
-from ucfrec.logs.summary import note_undefined
+from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
+    EXPOSED,
     PANDAS_INDEX,
     Table,
     first_and_more,
@@ -41,8 +42,6 @@ _OTHERS: Final = {
 _EXPOSURE: Final = (*_KEYS, *_OTHERS)
 _MEASURED: Final = (schema.TIMESTAMP, schema.PROPENSITY)
 """Columns that may differ where an exposure is written twice."""
-_ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
-"""Columns that together only exposures have, and logs that were made of them."""
 _ONE_EXPOSURE: Final = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
 """SQL of the columns that are equal where an exposure is written twice."""
 _SAME_KEY: Final = (
@@ -92,43 +91,44 @@ def join_feedback(
 
     A row of feedback belongs to the latest exposure of its user and item, and of its `request_id`
     if it has one, that is at most `within_ms` older; to that one alone. Of several rows of feedback
-    the log has the largest value of every column that is a number or a truth value; where there is
-    none, 0.
+    the log has the largest value, other than 0, of every column that is a number or a truth value;
+    0 where there is none.
 
     An `InputNote` says which columns of feedback are left out, as they are text or have the name of
-    a column of exposures, and what may be wrong where no row of feedback matches.
+    a column of exposures, and what may be wrong where a fifth of the feedback or more has no match.
 
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
-        out: Parquet file: the columns of the exposures, `feedback` and those of the feedback. Where
-            the exposures are a log of this function, `feedback` counts both, and of a number that
-            both have it is the larger value.
+        out: Parquet or CSV file: the columns of the exposures, `feedback` and those of the
+            feedback. Where the exposures are a log of this function, `feedback` counts both, and of
+            a number that both have it is the larger value.
         mapping: log columns to the columns of the feedback, and which of its rows count.
 
     Raises InputError if a file or column is missing, or of a wrong type; a file of feedback is one
     of exposures; or `out` is one of them.
     """
+    require_table_names([out])
     shown_files, feedback_files = log_files(exposures), log_files(feedback)
     files = [*shown_files, *feedback_files]
     require_other_files([out], files)
     mapping = mapping or LogMapping()
-    with (
-        scratch_folder(Path(gettempdir()), "join") as folder,
-        engine(files, folder, memory_limit, shared=True) as connection,
-    ):
+    with engine(files, Path(gettempdir()), memory_limit, shared=True) as connection:
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
-        with explain_errors(connection, (*shown_tables, *tables), folder):
+        with explain_errors(connection, (*shown_tables, *tables), out.parent):
             further = _make_exposures(connection, shown_tables)
             columns = _make_feedback(connection, tables, mapping)
-            connection.execute(
-                "CREATE TABLE matches AS SELECT f.row AS feedback_row, e.row AS row FROM feedback f"
-                f" JOIN exposures e ON {_SAME_KEY} "
-                f"AND (f.{_REQUEST} IS NULL OR f.{_REQUEST} = e.{_REQUEST}) "
-                f"AND f.timestamp BETWEEN e.timestamp AND e.timestamp + {int(within_ms)} "
-                "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
+            # Of the exposures at one time, the last one counts.
+            matches = (
+                f"SELECT f.row AS feedback_row, e.row FROM feedback f ASOF JOIN (SELECT user_id, "
+                f"item_id, timestamp, {request}, max(row) AS row FROM exposures GROUP BY ALL) e ON "
+                f"{_SAME_KEY} AND f.{_REQUEST} IS NOT DISTINCT FROM e.{_REQUEST} "
+                f"AND f.timestamp >= e.timestamp WHERE f.{_REQUEST} IS {missing} "
+                f"AND f.timestamp <= e.timestamp + {int(within_ms)}"
+                for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )
+            connection.execute(f"CREATE TABLE matches AS {' UNION ALL '.join(matches)}")
             _write(connection, columns, further, out)
             ((exposure_rows, written, rows, matched, with_feedback),) = connection.sql(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
@@ -138,7 +138,7 @@ def join_feedback(
             joined = Joined(
                 exposure_rows, written - exposure_rows, with_feedback, matched, unmatched, columns
             )
-            if not joined.matched:
+            if unmatched >= MANY * rows > 0 or not matched:
                 warn_user(_why_unmatched(connection, joined))
             return joined
 
@@ -219,10 +219,10 @@ def _make_feedback(
     """Create the table `feedback` with its `row`; returns its columns of feedback,
     whose values are its columns value_0, …, so that any name is possible."""
     for table in tables:
-        if _names_of(table).keys() >= {*_ONLY_SHOWN}:
+        if table.of_exposures:
             raise InputError(
                 f"{table.files[0]} is not feedback: it has the columns of exposures "
-                f"({', '.join(_ONLY_SHOWN)}), as a log of join has; name the exposures once, by "
+                f"({', '.join(EXPOSED)}), as a log of join has; name the exposures once, by "
                 "their folder or as a pattern in quotes that the shell does not expand, and then "
                 "files of feedback"
             )
@@ -246,7 +246,7 @@ def _make_feedback(
             column = quote_name(name)
             if not _holds_feedback(whole.columns[name]):
                 column = f"CAST({column} AS VARCHAR)"  # it holds text of numbers, or nothing
-            values.append(f"CAST({column} AS DOUBLE) AS value_{n}")
+            values.append(f"nullif(CAST({column} AS DOUBLE), 0) AS value_{n}")
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
         source = narrow.with_texts(present.values(), requests)
@@ -331,12 +331,13 @@ def _write(
         f"{c.alias} AS {quote_name(c.name)}" for key, c in further.items() if key not in again
     ]
     for name, value in values.items():
-        sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
+        both, earlier = [value], further.get(name.casefold())
         if earlier is not None and earlier.is_number:
-            earlier_value, is_count = f"coalesce({earlier.alias}, 0)", name == FEEDBACK
-            larger = f"greatest({sql}, CAST({earlier_value} AS DOUBLE))"
-            sql = f"{sql} + CAST({earlier_value} AS BIGINT)" if is_count else larger
-        selects.append(f"{sql} AS {quote_name(name)}")
+            both.append(f"nullif(CAST({earlier.alias} AS DOUBLE), 0)")
+        # Neither `list_sum` nor `list_max` counts what is missing.
+        sql = f"list_{'sum' if name == FEEDBACK else 'max'}([{', '.join(both)}])"
+        kind = "BIGINT" if name == FEEDBACK else "DOUBLE"
+        selects.append(f"CAST(coalesce({sql}, 0) AS {kind}) AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
     ((whole,),) = connection.sql(
         "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
@@ -350,12 +351,14 @@ def _write(
         "JOIN feedback f ON f.row = m.feedback_row GROUP BY m.row) USING (row) "
         "ORDER BY exposures.row"
     )
-    with atomic_file(out) as scratch:
-        write_batches(scratch, connection.sql(query).to_arrow_reader(BATCH_ROWS))
+    batches = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with atomic_file(out) as scratch, table_writer(scratch, out, batches.schema) as writer:
+        for batch in batches:
+            writer.write_batch(batch)
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:
-    """What may be wrong with feedback of which no row matches."""
+    """What may be wrong with feedback of which few rows match."""
     ((requests, equal, request, other_request, users, midnight),) = connection.sql(
         f"SELECT count({_REQUEST}), "
         f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), min({_REQUEST}), "
@@ -397,5 +400,8 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
             "its dates have no time of day and count as midnight, before what was shown on that "
             "day: log the time, too"
         )
-    rows = joined.unmatched
-    return f"none of the {rows:,} rows of feedback matches an exposure; {'; '.join(reasons)}"
+    rows = joined.matched + joined.unmatched
+    return (
+        f"{joined.unmatched:,} of {rows:,} rows of feedback "
+        f"({joined.unmatched / max(rows, 1):.0%}) match no exposure; {'; '.join(reasons)}"
+    )

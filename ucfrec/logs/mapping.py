@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from textwrap import shorten
 from typing import Final, get_args
 
 from ucfrec import schema
@@ -309,6 +308,11 @@ def table_name(file: Path) -> str:
 def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
     """The tables at a path, those of a folder and its sub-folders by name; `parents` are the
     folders that it lies in, without links, for a link may lead back to one of them."""
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"{path} is a link to a file that does not exist; fetch that file, e.g. with git annex "
+            "get or dvc pull, or remove the link"
+        )
     if not path.is_dir():
         if path.name.lower().endswith(_OTHER_TABLES):
             warn_user(f"{path} is not read; {_CONVERT}")
@@ -405,5 +409,5 @@ def _download(name: str, release: Release, archive: Path) -> None:
     except Exception as error:  # of several libraries, for names, connections, certificates, status
         if "does not match the known hash" in str(error):
             raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
-        reason = shorten(str(error) or type(error).__name__, 200, placeholder=" …")
+        reason = str(error) or type(error).__name__
         raise InputError(f"{name} cannot be downloaded ({reason}); {by_hand}") from None

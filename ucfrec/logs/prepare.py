@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import pyarrow as pa
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
@@ -23,6 +24,7 @@ from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
+    count_features,
     encode_ids,
     feature_digest,
     load_features,
@@ -32,6 +34,7 @@ from ucfrec.logs.features import (
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
+from ucfrec.logs.tables import first_and_more
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
@@ -220,11 +223,13 @@ def read_log(
     store: Path | None = None,
     grows: bool = False,
     keep_unknown: bool = False,
+    held: pa.Table | None = None,
 ) -> Iterator[PreparedLog]:
     """Sort and count a log; users and items of a `store` keep their numbers.
 
     If it `grows`, the log is added to it, and other ids follow; if not, it is evaluated on: a
-    single split, no features, and other items only with `keep_unknown`.
+    single split, no features, and other items only with `keep_unknown`. Rows of `held` (user, item,
+    time) count as duplicates.
     """
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
@@ -243,7 +248,7 @@ def read_log(
         with progress(4, "check the logs", "stages") as stage:
             opened = open_log_tables(connection, files, mapping, reward, session_by)
             mapping, reward = opened.mapping, opened.reward
-            with explain_errors(connection, opened.tables, spill):
+            with explain_errors(connection, opened.tables):
                 if options.engine == "spark":
                     from ucfrec.logs.spark import sort_with_spark  # an extra
 
@@ -251,9 +256,11 @@ def read_log(
                         opened, known_items, scratch, options.duplicates, options.spark_master
                     )
                 else:
-                    log = open_log(opened, spill, sessions.list_text_ids(store))
+                    log = open_log(opened, sessions.list_text_ids(store))
                     by_session = log.session_by == schema.SESSION_ID
-                    rows = sort_rows(log, known_items, options.duplicates, scratch, by_session)
+                    rows = sort_rows(
+                        log, known_items, options.duplicates, scratch, by_session, held
+                    )
                 log = rows.log
                 summary.require_rows(log, rows.count, rows.dropped, store if grows else None)
                 summary.note_losses(rows, reward, mapping.where)
@@ -291,6 +298,13 @@ def read_log(
                     "min_steps": options.min_steps,
                     "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
+                    "feature_tables": {
+                        name: {
+                            first_and_more([*map(Path, t.files)]): count_features(connection, rows)
+                            for t, rows in zip(tables_of_ids[name], names, strict=True)
+                        }
+                        for name, names in features.items()
+                    },
                 }
                 stage.update()
         yield PreparedLog(rows, cut, features, report, scratch)

@@ -39,6 +39,8 @@ CODES: Final = {
 """Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
 FAULTY: Final = "faulty"
 """View of all rows, as of `mark_faults`."""
+HELD: Final = "held"
+"""Relation of rows that a store has already."""
 FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
 DUPLICATES: Final = {
     "highest": "has the highest",
@@ -260,16 +262,21 @@ def sort_rows(
     duplicates: str,
     folder: Path | None,
     by_session: bool = False,
+    held: pa.Table | None = None,
 ) -> SortedRows:
     """Sort the rows of a log with DuckDB.
 
     Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
     `duplicates` is a key of `DUPLICATES`, `folder` for scratch (None for a log in memory). With
-    `by_session`, the rows of a session follow each other. Raises InputError if a reward is too
+    `by_session`, the rows of a session follow each other. Rows whose user, item and time are those
+    of a row of `held` (ids are text) are duplicates. Raises InputError if a reward is too
     large to train with.
     """
     connection = log.connection
-    connection.execute(f"CREATE VIEW {FAULTY} AS {mark_faults(log, ROWS, known_items)}")
+    if held is not None:
+        connection.register(HELD, held)
+    marked = mark_faults(log, ROWS, known_items, held is not None)
+    connection.execute(f"CREATE VIEW {FAULTY} AS {marked}")
     connection.execute("CREATE MACRO conv(digits, a, b) AS CAST('0x' || digits AS BIGINT)")
     for name, table in code_tables(log).items():
         connection.execute(f"CREATE TABLE {table} AS {code_ids(name, ROWS)}")
@@ -297,9 +304,10 @@ def code_ids(name: str, rows: str) -> str:
     )
 
 
-def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
+def mark_faults(log: TypedLog, rows: str, known_items: Path | None, any_held: bool = False) -> str:
     """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
-    get a hash. With `known_items`, of a store, other items are a fault."""
+    get a hash. With `known_items`, of a store, other items are a fault; with `any_held`, rows of
+    the relation `HELD`."""
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS
@@ -314,6 +322,10 @@ def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
         source = f"read_parquet({quote(glob_pattern(known_items))}, hive_partitioning = false)"
         known_ids = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
         conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known_ids})"
+    if any_held:
+        names = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+        key = ", ".join(f"CAST({name} AS VARCHAR)" for name in names)
+        conditions["duplicate"] = f"({key}) IN (SELECT {key} FROM {HELD})"
     cases = " ".join(
         f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
     )

@@ -96,7 +96,7 @@ def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Itera
         files = (*task.table.files, *task.more_files)
         with (
             engine(files, folder, MEMORY, threads=1) as connection,
-            explain_errors(connection, (task.table,), folder),
+            explain_errors(connection, (task.table,)),
         ):
             yield from connection.sql(task.query).to_arrow_reader(BATCH_ROWS)
 
@@ -137,7 +137,7 @@ def _type_rows(
 ) -> tuple[TypedLog, Any]:
     """The log, and a Spark frame of its rows as of `mark_faults`, read from files in `scratch`."""
     typed = type_columns(tables)
-    with explain_errors(tables.connection, tables.tables, scratch):
+    with explain_errors(tables.connection, tables.tables):
         every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
         tables.connection.execute(f"CREATE VIEW {ROWS} AS {number_rows(every)}")
     files = [

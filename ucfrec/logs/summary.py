@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.record import LONG
 from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
-from ucfrec.logs.engine import bind
+from ucfrec.logs.engine import bind, text_of_column
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.logs.rows import DUPLICATES, REASONS, SortedRows, mix_bits
 from ucfrec.logs.sessions import (
@@ -216,6 +217,10 @@ def format_report(report: Mapping[str, Any]) -> str:
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
     ]
+    for name, tables in report.get("feature_tables", {}).items():
+        for file, kinds in tables.items():
+            columns = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no columns"
+            lines.append((f"{name} features", f"{columns} from {one_line(file)}"))
     lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
     if (share := report.get("return_length_share")) is not None:
         ahead = f"{share:.0%} of its variance is the number of steps left"
@@ -256,10 +261,10 @@ def require_rows(
     if count:
         return
     n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
-    if grown is not None and late and late == n_wanted:
-        (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
+    if grown is not None and 0 < n_wanted == late + dropped["duplicate"]:
+        before = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.earliest_ms - 1}"
         # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
-        if EARLIEST_MS <= latest < log.earliest_ms:
+        if log.one(f"SELECT count(*) FROM {ROWS} WHERE {before}")[0] >= late:
             raise NoRowsError(
                 f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
                 f"of {_clock(log.earliest_ms - 1)} UTC; give newer logs"
@@ -370,15 +375,13 @@ def note_undefined(
 
 def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMapping) -> None:
     """Warn of many equal times, of one item only, and of sessions as long as those of bots."""
-    time = mapping.columns.get(schema.TIMESTAMP, schema.TIMESTAMP)
     user = mapping.columns.get(schema.USER_ID, schema.USER_ID)
     if rows.tied > MANY * rows.count:
         _note(
             rows,
             f"{rows.tied / rows.count:.0%} of the rows share their time with another row of "
             "the user, so their order is unknown and is not learned; log finer times, or add the "
-            f'place on a page: --column "timestamp={time} + position" for milliseconds, --column '
-            f'"timestamp={time} + to_milliseconds(position)" for dates',
+            f"place on a page{_propose_times(rows.log, mapping)}",
         )
     if report.get("items") == 1:
         _note(
@@ -402,6 +405,22 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"sessions of more than {LONG} times that, as bots have: {bots}; leave them out with "
             f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
         )
+
+
+def _propose_times(log: TypedLog, mapping: LogMapping) -> str:
+    """The option that adds the position to the times of a log; empty where it cannot be run."""
+    texts = {text_of_column(log.connection, t, mapping, schema.TIMESTAMP) for t in log.tables}
+    time = min(texts)
+    if len(texts) > 1 or mapping.time_format or "'" in time:
+        return ""
+    for sum_of in ("{} + to_milliseconds({})", "{} + {}", "{}::TIMESTAMPTZ + to_milliseconds({})"):
+        expression = sum_of.format(time, schema.POSITION)
+        with suppress(InputError, duckdb.Error):
+            for table in log.tables:
+                sums = bind(log.connection, table, "", expression)
+                log.one(f"SELECT max({sums.sql}::VARCHAR) FROM {table.of(sums.columns).sql}")
+            return f": --column timestamp='{expression}'"
+    return ""
 
 
 def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any, Final, TextIO, cast
 
 import duckdb
+import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
 
@@ -32,6 +34,8 @@ _CSV_FAULT = re.compile(
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _MAX_FAULT = 300
 """Most characters of a message of DuckDB, which may quote values of any length."""
+_MOST_NESTED: Final = 32
+"""Most levels of a Parquet column; a list is two, and DuckDB's time doubles with each list."""
 NOTHING: Final = '"NULL"'
 """DuckDB type of a column without any value."""
 ISO_TIME: Final = (
@@ -39,6 +43,8 @@ ISO_TIME: Final = (
     r"([T ]\d{1,2}:\d{1,2}(:\d{1,2}([.,]\d+)?)?\s*(Z|UTC|[+-]\d{2}(:?\d{2})?)?)?"
 )
 """Times that have one meaning: the year comes first."""
+EXPOSED: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
+"""Columns that together only exposures have, and logs that `join` made of them."""
 PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
 """Column in which pandas keeps the numbers of the rows of a frame: no data."""
 _NO_VALUE: Final = "__HIVE_DEFAULT_PARTITION__"
@@ -47,6 +53,8 @@ _FILE: Final = "ucfrec: file"
 _RAW: Final = "ucfrec: text of "
 
 MAX_FLOAT = 3.4028235e38
+WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
+"""DuckDB type of reals to the bound below which it holds every whole number."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +80,11 @@ class Table:
     def columnar(self) -> bool:
         """Whether reading a column again is cheap, because text need not be parsed."""
         return self.files[0].suffix.lower() == ".parquet"
+
+    @property
+    def of_exposures(self) -> bool:
+        """Whether they have the columns of exposures, as a log of `join` has."""
+        return {*EXPOSED} <= {name.casefold() for name in self.columns}
 
     def of(self, selected: Iterable[str], raw: Iterable[str] = ()) -> "Table":
         """The same table with some of its columns, so that others cost nothing."""
@@ -281,13 +294,13 @@ def _columns(
         require_plausible_size(file)
     source = Table((file,), ()).source
     try:
-        types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         if is_parquet:
-            metadata = f"parquet_file_metadata({quote(glob_pattern(file))})"
-            ((rows,),) = connection.sql(f"SELECT num_rows FROM {metadata}").fetchall()
-            require_plausible_rows(file, rows)
+            _require_plausible(file)
+        types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
-    except duckdb.Error as error:
+    except (duckdb.Error, pa.ArrowException, OSError) as error:
+        if "too deeply nested" in str(error):
+            raise _nested_too_deep(file, "a column") from None
         if "not utf-8 encoded" in str(error):
             raise InputError(
                 f"{file} is not in UTF-8; convert it, e.g. with iconv -t UTF-8"
@@ -307,6 +320,23 @@ def _columns(
     for name in set(second).difference(_written_names(file) if second else ()):
         raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
     return columns if is_parquet else _types_of_all_rows(connection, file, columns)
+
+
+def _require_plausible(file: Path) -> None:
+    """Refuse a Parquet file of very many equal rows, or with values that are nested so deep that
+    DuckDB would not end."""
+    metadata = pq.read_metadata(file)
+    require_plausible_rows(file, metadata.num_rows)
+    for path in (metadata.schema.column(n).path for n in range(metadata.num_columns)):
+        if path.count(".") > _MOST_NESTED:
+            raise _nested_too_deep(file, f"column {path.partition('.')[0]}")
+
+
+def _nested_too_deep(file: Path, column: str) -> InputError:
+    return InputError(
+        f"{file}: {column} has lists in lists, more than {_MOST_NESTED // 2} levels deep; flatten "
+        "or remove it"
+    )
 
 
 def _require_header(file: Path, columns: Sequence[str]) -> None:
@@ -411,7 +441,7 @@ def first_line(error: Exception) -> str:
     return f"{str(error).splitlines()[0]:.{_MAX_FAULT}}"
 
 
-def fault_of_line(error: duckdb.Error) -> InputError | None:
+def fault_of_line(error: Exception) -> InputError | None:
     """Error that names the line of a CSV file which cannot be read; None for other errors."""
     fault, column = _CSV_FAULT.search(str(error)), _CSV_COLUMN.search(str(error))
     if fault is None:

@@ -12,13 +12,22 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
-from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, settle_mapping, wrong_type
+from ucfrec.logs.engine import (
+    BATCH_ROWS,
+    Bound,
+    bind,
+    explain_errors,
+    settle_mapping,
+    text_of_column,
+    wrong_type,
+)
 from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 from ucfrec.logs.tables import (
     ISO_TIME,
     MAX_FLOAT,
     NOTHING,
+    WHOLE,
     Table,
     cast_timestamp,
     first_and_more,
@@ -181,10 +190,10 @@ def number_rows(selects: Iterable[tuple[str, str]]) -> str:
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
-def open_log(log: LogTables, folder: Path, as_text: Collection[str] = ()) -> TypedLog:
+def open_log(log: LogTables, as_text: Collection[str] = ()) -> TypedLog:
     """Create `read` from the tables of a log; see `type_columns` and `describe_log`."""
     typed = type_columns(log, as_text)
-    with explain_errors(log.connection, log.tables, folder):
+    with explain_errors(log.connection, log.tables):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
         columnar = all(table.columnar for table in log.tables)
         rows = number_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
@@ -270,7 +279,8 @@ _Values = dict[str, tuple[str, str]]
 def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Table, _Values]:
     """A table with the columns that are read, and the typed values of these."""
     connection, mapping = log.connection, log.mapping
-    texts = {name: mapping.columns.get(name) or name for name in columns}
+    texts = {name: text_of_column(connection, table, mapping, name) for name in columns}
+    time_format = None if table.of_exposures else mapping.time_format
     bound = {
         name: bind(connection, table, f"for {name}; map it with --column {name}=...", expression)
         for name, expression in texts.items()
@@ -280,7 +290,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         name: value.columns[0]
         for name, value in bound.items()
         if not table.columnar and value.is_column and value.columns[0] in dict(table.types)
-        if name in _IDS or (name == schema.TIMESTAMP and mapping.time_format)
+        if name in _IDS or (name == schema.TIMESTAMP and time_format)
     }
     for name, column in raw.items():
         bound[name] = Bound(quote_name(raw_name(column)), "VARCHAR", (), False)
@@ -300,7 +310,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         sources.append(condition)
     narrow = table.of((column for value in sources for column in value.columns), raw.values())
     values = {
-        name: cast_value(connection, narrow, name, texts[name], value, mapping.time_format)
+        name: cast_value(connection, narrow, name, texts[name], value, time_format)
         for name, value in bound.items()
     }
     return narrow, {**values, **extra}
@@ -342,6 +352,8 @@ def cast_value(
     nothing = "false" if name == schema.IS_RANDOM else f"CAST(NULL AS {_TYPES[name]})"
     if kind == NOTHING:
         return nothing, NOTHING
+    if name in _IDS or name == schema.TIMESTAMP:
+        _require_exact(connection, table, name, expression, bound.columns)
     if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
@@ -378,6 +390,33 @@ def cast_value(
     raise wrong_type(table, name, expression, kind, remedy)
 
 
+def _require_exact(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    name: str,
+    expression: str,
+    columns: Sequence[str],
+) -> None:
+    """Refuse an id or a time of columns of reals that do not hold every whole number there is."""
+    for column in columns:
+        kind = table.columns[column]
+        # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
+        if kind not in WHOLE or (name == schema.TIMESTAMP and kind == "DOUBLE"):
+            continue
+        with explain_errors(connection, (table,)):
+            ((rounded, count),) = connection.sql(
+                f"SELECT count_if(abs(x) >= {WHOLE[kind]}), count(x) FROM "
+                f"(SELECT {quote_name(column)} AS x FROM {table.of([column]).sql})"
+            ).fetchall()
+        if rounded:
+            raise InputError(
+                f"{table.files[0]}: {name} ({expression}) reads {column}, which is {kind} "
+                f"(float{32 if kind == 'FLOAT' else 64}): {rounded:,} of {count:,} values are "
+                f"{WHOLE[kind]:,} or more and rounded; write them as int64 where the log is made, "
+                "as a cast here cannot restore them"
+            )
+
+
 def _unify_ids(
     connection: duckdb.DuckDBPyConnection,
     selects: list[tuple[Table, _Values]],
@@ -394,7 +433,7 @@ def _unify_ids(
         csv_type = next((dict(table.types)[column] for column in raw), None)
         all_integers = is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT")
         if csv_type is not None:
-            with explain_errors(connection, (table,), table.files[0].parent):
+            with explain_errors(connection, (table,)):
                 ((any_integer, all_integers),) = connection.sql(
                     f"SELECT coalesce(bool_or({_IS_INTEGER}), false), "
                     f"coalesce(bool_and({_IS_INTEGER}), true) "
@@ -449,7 +488,7 @@ def cast_text_time(
     if time_format is not None:
         time = f"try_strptime(trim({sql}), {quote(time_format)})"
         return f"epoch_ms(TRY(CAST({time} AS TIMESTAMPTZ)))"
-    with explain_errors(connection, (table,), table.files[0].parent):
+    with explain_errors(connection, (table,)):
         surveys = [_survey(connection, replace(table, files=(f,)), sql) for f in table.files]
     numbers, iso = any(s.numbers for s in surveys), any(s.iso for s in surveys)
     dated = [(file, s) for file, s in zip(table.files, surveys, strict=True) if s.dated]

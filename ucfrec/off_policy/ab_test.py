@@ -113,7 +113,7 @@ def always_valid(difference: float, variance: float, expected: float) -> tuple[f
 def compare_arms(
     paths: Sequence[str | Path],
     column: str = FEEDBACK,
-    arms: tuple[str, str] | None = None,
+    arms: Sequence[str] | None = None,
     expected: float | None = None,
     memory_limit: str = "2GB",
 ) -> Comparison:
@@ -212,7 +212,7 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
             f"FROM {table.with_texts([column], (schema.USER_ID, schema.ARM)).sql}"
             for table in tables
         )
-        with explain_errors(connection, tables, folder):
+        with explain_errors(connection, tables):
             groups: dict[str, Any] = connection.execute(
                 "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM ("
                 "SELECT who, arm, coalesce(sum(value), 0) AS value, "

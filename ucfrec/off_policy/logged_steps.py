@@ -244,7 +244,7 @@ def _convert_to_floats(name: str, values: Any) -> Float64Array:
     try:
         column = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is no array of numbers ({error!s:.200})") from None
+        raise InputError(f"{name} is no array of numbers ({error})") from None
     if column.ndim != 1:
         raise InputError(f"{name} has shape {column.shape}; give one number a step")
     return column

@@ -109,7 +109,7 @@ def _read_metadata(file: Path, trained: TrainedPolicy, rule: DecisionRule) -> pq
     try:
         described = pq.read_metadata(file)
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{file} cannot be read ({one_line(str(error)):.200})") from None
+        raise InputError(f"{file} cannot be read ({error})") from None
     columns = described.schema.names
     if missing := [name for name in (*_KEYS, *_WEIGHED) if name not in columns]:
         raise InputError(
@@ -132,9 +132,7 @@ def _read_batches(file: Path, names: Sequence[str]) -> Iterator[dict[str, Array]
             for batch in source.iter_batches(_BATCH_ROWS, columns=list(names)):
                 yield {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
     except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            f"{file} is damaged ({one_line(str(error)):.200}); write it with ucfrec score again"
-        ) from None
+        raise InputError(f"{file} is damaged ({error}); write it with ucfrec score again") from None
 
 
 def _read_whole_sessions(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Array]]]:

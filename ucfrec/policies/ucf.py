@@ -68,7 +68,8 @@ class UCFPaperConfig(UCFConfig):
     """Settings of the policy as read in the paper: attention is supervised."""
 
     lambda_mask: Weight = 0.1
-    """λ, weight of the mask loss, which supervises attention (Table 7)."""
+    """λ, weight of the mask loss, which supervises attention. The paper prints no value; this one
+    is ours."""
     exposure: bool = False
     """Whether the logits of items depend on what the session was shown lately."""
     return_to_go: Returns = "session"
@@ -163,9 +164,10 @@ class UCFPolicy(SequencePolicy):
 
 
 class UCFPaperPolicy(UCFPolicy):
-    """UCF as read in the paper, without what later measurements added: augmented states, λ 0.1, a
-    plain CVAE as reward model at Table 4's rate and passes, the paper's generator, the return of
-    the whole rest, and the most probable action at the largest training return."""
+    """UCF as read in the paper, without what later measurements added: augmented states, λ 0.1
+    (our choice), a plain CVAE as reward model at Table 4's rate and passes, the paper's generator,
+    all transitions, the return of the whole rest, and the most probable action at the largest
+    training return."""
 
     Config = UCFPaperConfig
     augmented = True
@@ -173,7 +175,9 @@ class UCFPaperPolicy(UCFPolicy):
         "crm.mean_first": False,
         "crm.learning_rate": 3e-4,
         "crm.epochs": 40,
+        "crm.max_transitions": 10**9,
         "csg.kind": "faithful",
+        "csg.max_transitions": 10**9,
         "rule.choose": False,
         "train.average": 0.0,
     }

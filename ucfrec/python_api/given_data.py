@@ -3,8 +3,9 @@
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from tempfile import gettempdir
@@ -25,7 +26,7 @@ from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import histories_of_frame, select_users
-from ucfrec.runs.later_logs import later_logs
+from ucfrec.runs.later_logs import columns_used, later_logs, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, shown
 
@@ -33,6 +34,8 @@ Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""
 Columns = LogMapping | Mapping[str, str] | str | Path
 """What the columns of logs mean, only the names of some, or a TOML file as of `--mapping`."""
+Resolved = tuple[tuple[Path, ...], LogMapping]
+"""Files of logs and what their columns mean."""
 _FRAME: Final = "frame.parquet"
 _KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
 _OPTIONS: Final = (
@@ -117,15 +120,11 @@ def prepare_store(
     columns, dataset = _read_columns(mapping), options.get("dataset", "generic")
     if "dataset" in options and not _are_paths(data):
         raise InputError(f"dataset is {dataset!r}, but only files have one; leave it out")
-    frame = None
-    if isinstance(data, LogFiles):
-        files, columns, dataset = data.files, columns.over(data.mapping), data.dataset
-    elif _are_paths(data):
-        adapter: Dataset = load_plugin("datasets", dataset)
-        files, columns = adapter.resolve(_list_paths(data), columns)
-    else:
-        frame = _write_frame(data, scratch)
-        files = (frame,)
+    adapter: Dataset = load_plugin("datasets", dataset)
+    files, columns, frame = _find_files(
+        data, columns, adapter.resolve, scratch, columns, options.get("reward")
+    )
+    dataset = data.dataset if isinstance(data, LogFiles) else dataset
     with use_words_of_python(frame):
         how = PrepareOptions(**{**options, "dataset": dataset})
         _require_gap(options, how.session_by or columns.session_by)
@@ -191,14 +190,9 @@ def open_files(
         InputError: a path is missing, or the frame cannot be used.
     """
     columns = _read_columns(mapping)
-    if isinstance(logs, LogFiles):
-        yield logs.files, columns.over(logs.mapping), None
-    elif _are_paths(logs):
-        yield *later_logs(trained, _list_paths(logs), columns), None
-    else:
-        with scratch_folder(Path(gettempdir()), "frame") as scratch:
-            file = _write_frame(logs, scratch)
-            yield (file,), columns, file
+    how = columns_used(trained, columns), reward_of(trained)
+    with scratch_folder(Path(gettempdir()), "frame") as scratch:
+        yield _find_files(logs, columns, partial(later_logs, trained), scratch, *how)
 
 
 def read_histories(
@@ -230,19 +224,29 @@ def read_histories(
     return histories if ids is None else select_users(histories, ids)
 
 
-def _write_frame(frame: Any, scratch: Path) -> Path:
+def _find_files(
+    logs: Any,
+    columns: LogMapping,
+    resolve: Callable[[Sequence[str | Path], LogMapping], Resolved],
+    scratch: Path,
+    used: LogMapping,
+    reward: str | None,
+) -> tuple[tuple[Path, ...], LogMapping, Path | None]:
+    """Files of logs, their mapping, and the file in `scratch` to which a frame is written: the
+    columns that are `used`, or that the `reward` reads."""
+    if isinstance(logs, LogFiles):
+        return logs.files, columns.over(logs.mapping), None
+    if _are_paths(logs):
+        paths = [logs] if isinstance(logs, (str, Path)) else list(logs)
+        return *resolve(paths, columns), None
     file = scratch / _FRAME
-    pq.write_table(log_table(frame, "data"), file)
-    return file
+    pq.write_table(log_table(logs, "data", used, reward), file)
+    return (file,), columns, file
 
 
 def _are_paths(logs: object) -> bool:
     several = isinstance(logs, Sequence) and all(isinstance(path, (str, Path)) for path in logs)
     return isinstance(logs, (str, Path)) or several
-
-
-def _list_paths(logs: Any) -> list[str | Path]:
-    return [logs] if isinstance(logs, (str, Path)) else list(logs)
 
 
 @contextmanager

@@ -350,7 +350,6 @@ class Recommender:
                 filter_seen=filter_seen,
                 liked=liked,
                 seed=seed,
-                checkpoint="best",
             )
 
     @_checked
@@ -381,7 +380,6 @@ class Recommender:
                 [_name_logs(logs)],
                 options=options,
                 seed=seed,
-                checkpoint="best",
             )
 
     @_checked
@@ -407,11 +405,10 @@ class Recommender:
         simulated = Environment(environment) if isinstance(environment, str) else environment
         return evaluate_in(
             simulated,
-            {trained.folder: (trained, rule or trained.rule)},
+            [(trained, rule or trained.rule)],
             beside,
             episodes=episodes,
             seed=seed,
-            checkpoint="best",
         )
 
     @_checked

@@ -1,14 +1,13 @@
 """What `Recommender.fit` and `ucfrec train` do alike; and the folders that the former leaves."""
 
 import shutil
-import warnings
 import weakref
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.fitting.distributed import leads, processes
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.reporting.model_card import write_card
@@ -43,11 +42,9 @@ def train_policy(
     elif processes() == 1:
         refit_within(store, out)
     elif leads():
-        warnings.warn(
+        warn_user(
             "several processes do not learn from all rows; run the same command in one process, "
-            "which then only does that",
-            InputNote,
-            stacklevel=2,
+            "which then only does that"
         )
     if leads():
         write_card(out)

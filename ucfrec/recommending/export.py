@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
@@ -30,14 +29,11 @@ OUTPUTS: Final = ("scores", "top_items", "top_scores")
 TOLERANCE: Final = 1e-5
 """Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
 """
-_STATE: Final = ("items", "rewards", "steps", "collected", "users")
+_STATE: Final = ("items", "rewards", "steps", "collected", "users", "observations")
 """Inputs: the first fields of `Sessions`, of which `items` are the actions."""
 _EXCLUDED: Final = "excluded"
-_OBSERVATIONS: Final = "observations"
 _OPSET: Final = 20
 _DEFAULT_K: Final = 100
-_CHUNK: Final = 2**16
-"""Items among which the best are looked for at once."""
 _COMPARED: Final = 16
 """Random sessions on which a graph is compared with torch."""
 _MOST_EXCLUDED: Final = 0.5
@@ -51,7 +47,7 @@ _MEANINGS: Final = {
     "users": "index of the user in user_ids; -1 for others",
     _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "
     "column",
-    _OBSERVATIONS: "of the last steps, the one to decide included; `ucfrec recommend` repeats the "
+    "observations": "of the last steps, the one to decide included; `ucfrec recommend` repeats the "
     "last",
     "scores": "policy_weight times the policy's log-probability plus reward_weight times what the "
     "reward model says, with a lookahead also of what follows, up to a constant; -inf for items "
@@ -82,7 +78,7 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, see `_write_graph`) and `model.json`.
+    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
@@ -96,33 +92,29 @@ def export(
     """
     _require_installed()
     graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
-    arguments = _draw_arguments(graph.scorer, 3, seed=0)
+    example = _draw_arguments(graph.scorer, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
-    shapes: dict[str, Any] = {name: {0: batch} for name in arguments}
-    shapes[_EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
-    inputs: tuple[Any, ...] = tuple(arguments.values())
-    if _OBSERVATIONS not in arguments:
-        shapes[_OBSERVATIONS], inputs = None, (*inputs, None)
-    names = list(arguments), list(OUTPUTS)
+    shapes: list[dict[int, Any]] = [{0: batch} for _ in example]
+    shapes[-1][1] = torch.export.Dim("excluded_items", min=1, max=2**24)
     with atomic_folder(out) as scratch:
         path, difference = scratch / GRAPH, 0.0
-        _write_graph(graph, inputs, path, names, trained.name, _SERVE, shapes)
-        runner = _start_runner(path)
+        sizes = {"inputs": tuple(shapes)}
+        write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
+        runner = start_runner(path)
         for sessions in (_COMPARED, 1):
             arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
             results = _run_graph(runner, arguments)
             with torch.no_grad():
-                expected = graph(**arguments)
-            pairs = zip(
-                results[::2], expected[::2], strict=True
-            )  # scores, without numbers of items
+                expected = graph(*arguments.values())
+            # The scores, without the numbers of items.
+            pairs = zip(results[::2], expected[::2], strict=True)
             size = measure_magnitude(graph.scorer)
             difference = max(difference, require_close(pairs, _SERVE, size))
-        sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
+        files = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
         outputs = dict(zip(OUTPUTS, expected, strict=True))
         description = _describe_graph(graph.scorer, trained, arguments, outputs)
-        write_json(scratch / DESCRIPTION, description | {"files": list(sizes)})
-    return Exported(sum(sizes.values()), difference)
+        write_json(scratch / DESCRIPTION, description | {"files": list(files)})
+    return Exported(sum(files.values()), difference)
 
 
 class _Network(nn.Module):
@@ -159,51 +151,29 @@ class RuleGraph(_Network):
             "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc",
         )
         self._items = len(scorer.states.embeddings)
-        self._k, most = min(_DEFAULT_K, self._items) if k is None else k, min(self._items, _CHUNK)
-        if not 1 <= self._k <= most:
+        self._k = min(_DEFAULT_K, self._items) if k is None else k
+        if not 1 <= self._k <= self._items:
             raise InputError(
                 f"--k is {k}; the run has {self._items:,} items: give a whole number from 1 to "
-                f"{most:,}"
+                f"{self._items:,}"
             )
 
-    def forward(  # type: ignore[override]
-        self,
-        items: Tensor,
-        rewards: Tensor,
-        steps: Tensor,
-        collected: Tensor,
-        users: Tensor,
-        excluded: Tensor,
-        observations: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scores (B, n_items), the k best items (B, k) and their log-probabilities (B, k).
 
-        The inputs are the fields of `Sessions`, and the items `excluded` (B, E), padded with −1.
+        The inputs are the fields of `Sessions`, and last the items excluded (B, E), padded with −1.
         """
+        *session, excluded = inputs
         places = torch.where(excluded < 0, self._items, excluded)
         nothing = torch.zeros(excluded.shape[0], self._items + 1, dtype=torch.bool)
         left_out = nothing.scatter(1, places, torch.ones_like(places, dtype=torch.bool))[:, :-1]
-        sessions = Sessions(items, rewards, steps, collected, users, observations)
-        scores = self.scorer.scores(sessions, excluded=left_out, empty=True)
+        scores = super().forward(*session, left_out)
         return scores, *find_best(scores, self._k)
 
 
 def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The k best items (B, k), −1 where fewer are left, and their log-probabilities (B, k).
-
-    Exact: the best of all are among the best of each chunk.
-    """
-    n = scores.shape[1]
-    chunks = -(-n // _CHUNK)
-    if chunks > 1:
-        padded = F.pad(scores, (0, chunks * _CHUNK - n), value=-torch.inf)
-        best = padded.view(-1, chunks, _CHUNK).topk(k, dim=-1)
-        offsets = torch.arange(0, chunks * _CHUNK, _CHUNK).view(1, -1, 1)
-        numbers = (best.indices + offsets).flatten(1)
-        values, places = best.values.flatten(1).topk(k, dim=-1)
-        items = numbers.gather(1, places)
-    else:
-        values, items = scores.topk(k, dim=-1)
+    """The k best items (B, k), −1 where fewer are left, and their log-probabilities (B, k)."""
+    values, items = scores.topk(k, dim=-1)
     left = values > -torch.inf
     highest = torch.where(left[:, :1], values[:, :1], 0.0)
     total = (scores - highest).exp().sum(1, keepdim=True).log() + highest
@@ -232,11 +202,10 @@ class ScoreGraph:
 
         session, excluded = draw_example(seed=0)
         example = {**_name_inputs(session), _EXCLUDED: excluded}
-        names = list(example), ["scores"]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / GRAPH
-            _write_graph(network, tuple(example.values()), path, names, kind, _TORCH)
-            self._runner = _start_runner(path, threads=1)
+            write_graph(network, example, path, ["scores"], kind, _TORCH)
+            self._runner = start_runner(path, threads=1)
         size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = draw_example(seed=number)
@@ -279,20 +248,18 @@ def _draw_arguments(scorer: Scorer, sessions: int, seed: int) -> dict[str, Tenso
     """Random inputs of a `RuleGraph`, in the order of its arguments."""
     assert scorer.states is not None
     n, rng = len(scorer.states.embeddings), np.random.default_rng(seed)
-    values = _name_inputs(_draw_sessions(scorer, sessions, seed))
-    observations = {name: values.pop(name) for name in (_OBSERVATIONS,) if name in values}
     excluded = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
-    return values | {_EXCLUDED: torch.from_numpy(excluded)} | observations
+    inputs = _name_inputs(_draw_sessions(scorer, sessions, seed))
+    return inputs | {_EXCLUDED: torch.from_numpy(excluded)}
 
 
 def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
-    """The inputs of a graph, by name; the observations, if there are any, last."""
-    values = {name: getattr(sessions, name) for name in (*_STATE[1:], _OBSERVATIONS)}
-    values = {"items": sessions.actions} | values
-    return {name: value for name, value in values.items() if value is not None}
+    """The fields of sessions that are there, as inputs of a graph, by name."""
+    values = (getattr(sessions, field) for field in ("actions", *_STATE[1:]))
+    return {name: v for name, v in zip(_STATE, values, strict=True) if v is not None}
 
 
-def _start_runner(path: Path, threads: int = 0) -> Any:
+def start_runner(path: Path, threads: int = 0) -> Any:
     """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
     import onnxruntime
 
@@ -349,11 +316,11 @@ def _require_installed() -> None:
         ) from None
 
 
-def _write_graph(
+def write_graph(
     module: nn.Module,
-    arguments: tuple[Tensor, ...],
+    inputs: dict[str, Tensor],
     path: Path,
-    names: tuple[list[str], list[str]],
+    outputs: list[str],
     kind: str,
     remedy: str,
     shapes: dict[str, Any] | None = None,
@@ -364,19 +331,20 @@ def _write_graph(
     of a graph ends at 2 GB.
 
     Args:
-        names: of the inputs and of the outputs.
+        inputs: an example of each, by name.
+        outputs: their names.
         shapes: sizes that may vary; None for those of the example alone.
     """
     try:
         with _quiet(), torch.no_grad():
             # What is computed once must not be a part of the graph.
-            module(*arguments)
+            module(*inputs.values())
             torch.onnx.export(
                 module,
-                arguments,
+                tuple(inputs.values()),
                 path,
-                input_names=names[0],
-                output_names=names[1],
+                input_names=list(inputs),
+                output_names=outputs,
                 dynamic_shapes=shapes,
                 opset_version=_OPSET,
                 dynamo=True,
@@ -389,7 +357,7 @@ def _write_graph(
         # The exporter's own message lists its steps; the reason is that of the error behind it.
         reason = one_line(str(error.__cause__ or error).strip()) or type(error).__name__
         raise InputError(
-            f"torch cannot export policies of kind {kind!r} ({reason:.160}); {remedy}"
+            f"torch cannot export policies of kind {kind!r} ({reason}); {remedy}"
         ) from None
 
 

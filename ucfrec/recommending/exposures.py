@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Final
 from uuid import uuid4
 
@@ -15,8 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
+from ucfrec.files.parquet import table_writer
 from ucfrec.recommending.recommend import RANK
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -65,7 +67,7 @@ def exposures_written(
             writer.write_table(table)
             yield frame
 
-    with atomic_file(path) as scratch, pq.ParquetWriter(scratch, columns) as writer:
+    with atomic_file(path) as scratch, table_writer(scratch, path, columns) as writer:
         yield write_all()
 
 
@@ -90,7 +92,12 @@ class ExposureLog:
             seconds: after so long, a file is written if there are any rows.
             clock: seconds since 1970, when an answer is given.
         """
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=folder).close()
+        except OSError as error:
+            what = explain_os_error(error)
+            raise InputError(f"{folder} cannot be written ({what}); name another folder") from None
         self._folder, self._schema = folder, exposure_schema(trained)
         self._rows, self._seconds, self._clock = rows, seconds, clock
         self._waiting: list[tuple[str, int, Answer]] = []
@@ -113,10 +120,15 @@ class ExposureLog:
             self._wake.set()
 
     def close(self) -> None:
-        """Write what waits, and end the thread."""
+        """Write what waits, and end the thread; InputError if rows were lost."""
         self._closed = True
         self._wake.set()
         self._thread.join()
+        if self._lost:
+            raise InputError(
+                f"{self._folder}: {self._lost:,} rows of exposures are lost, as they could not be "
+                "written; make room, or make the folder writable"
+            )
 
     def _run(self) -> None:
         closed = False
@@ -130,9 +142,6 @@ class ExposureLog:
     def _flush(self, last: bool) -> None:
         with self._lock:
             waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
-            lost, self._lost = self._lost, 0
-        if lost:
-            _warn(f"{lost:,} rows are lost, as too many waited to be written")
         if not count:
             return
         name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
@@ -140,29 +149,20 @@ class ExposureLog:
             with atomic_file(self._folder / name) as scratch:
                 pq.write_table(self._table(waiting), scratch)
         except (OSError, InputError, pa.ArrowException) as error:
-            ends = "are lost" if last else "wait"
-            _warn(f"{self._folder / name} cannot be written: {error}; {count:,} rows {ends}")
-            if last:
-                return
             with self._lock:
-                self._waiting = waiting + self._waiting
-                self._count += count
+                if last:
+                    self._lost += count
+                else:
+                    self._waiting, self._count = waiting + self._waiting, self._count + count
+                what = f"{self._count:,} rows wait, {self._lost:,} are lost"
+            message = f"{self._folder / name} cannot be written: {error}; {what}"
+            print(f"ucfrec: exposures: {message}", file=sys.stderr, flush=True)
             # A full log would otherwise try again at every answer.
             time.sleep(min(1.0, self._seconds))
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
         rows = [
-            (
-                user,
-                item,
-                now,
-                answer.request_id,
-                position,
-                chance,
-                answer.run,
-                answer.rule,
-                answer.arm,
-            )
+            (user, item, now, answer.request_id, position, chance, *answer[4:])  # run, rule, arm
             for user, now, answer in waiting
             for position, (item, chance) in enumerate(
                 zip(answer.items, answer.propensities, strict=True), 1
@@ -170,7 +170,3 @@ class ExposureLog:
         ]
         frame = pd.DataFrame(rows, columns=self._schema.names)
         return pa.Table.from_pandas(frame, self._schema, preserve_index=False)
-
-
-def _warn(message: str) -> None:
-    print(f"ucfrec: exposures: {message}", file=sys.stderr, flush=True)

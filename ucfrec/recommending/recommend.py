@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
@@ -393,11 +393,12 @@ class ItemIndex:
             items_out = left_out[1][left_out[0] == row]
             row_out = torch.zeros_like(items_out), items_out
             session = sessions.at(torch.tensor([row]))
-            exact = self._scorer.scores(session, row_out, excluded, empty=True)[0].topk(k)
+            exact = self._scorer.scores(session, row_out, excluded, empty=True)
+            best = best_items(exact, k)[0]
             if short[row]:
-                items[row], scores[row] = exact.indices, exact.values
+                items[row], scores[row] = best, exact[0, best]
             if sampled[row]:
-                best = exact.indices[~torch.isneginf(exact.values)]
+                best = best[~torch.isneginf(exact[0, best])]
                 self.found += int(torch.isin(best, items[row]).sum())
                 self.wanted += len(best)
                 self.sampled += 1
@@ -416,17 +417,19 @@ class ItemIndex:
         query = scorer.query(sessions)
         part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
         factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
-        products, numbers = self._index.search(factors, count)
-        items, missing = torch.from_numpy(numbers), torch.from_numpy(numbers < 0)
-        items = items.clamp(min=0)
-        scores = scorer.scores_of_some(query, part, items, torch.from_numpy(products))
+        products, numbers = map(torch.from_numpy, self._index.search(factors, count))
+        # Of equal scores, the lowest number comes first.
+        numbers, order = numbers.sort()
+        items, missing = numbers.clamp(min=0), numbers < 0
+        scores = scorer.scores_of_some(query, part, items, products.gather(1, order))
         if excluded is not None:
             missing |= excluded[items]
         # Pairs of a row and an item are single numbers.
         rows = torch.arange(len(items)).unsqueeze(1) * n_items
         missing |= torch.isin(rows + items, left_out[0] * n_items + left_out[1])
-        best = scores.masked_fill(missing, -torch.inf).topk(k)
-        return items.gather(1, best.indices), best.values
+        scores = scores.masked_fill(missing, -torch.inf)
+        best = best_items(scores, k)
+        return items.gather(1, best), scores.gather(1, best)
 
 
 def similar_items(
@@ -467,12 +470,12 @@ def similar_items(
     for begin in range(0, len(all_numbers), _ITEMS_AT_ONCE):
         numbers = torch.from_numpy(all_numbers[begin : begin + _ITEMS_AT_ONCE])
         cosines = (vectors[numbers] @ vectors.T).scatter(1, numbers.unsqueeze(1), -torch.inf)
-        best = cosines.topk(k, dim=1)
+        best = best_items(cosines, k)
         columns = {
             schema.ITEM_ID: ids[numbers.numpy().repeat(k)],
             RANK: np.tile(np.arange(1, k + 1), len(numbers)),
-            SIMILAR_ITEM: ids[best.indices.numpy().ravel()],
-            SCORE: best.values.numpy().ravel(),
+            SIMILAR_ITEM: ids[best.numpy().ravel()],
+            SCORE: cosines.gather(1, best).numpy().ravel(),
         }
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)

@@ -168,22 +168,17 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
 
 def _describe(errors: Sequence[Any]) -> str:
     """The first of pydantic's errors in one line, and how many there are: one a place."""
-    # The place of an error in one of the types that a place takes ends with the type.
-    places = [
-        error["loc"][:-1]
-        if error["type"] != "extra_forbidden" and error["loc"] and error["loc"][-1] in _TYPES
-        else error["loc"]
-        for error in errors
-    ]
-    first = errors[0]
+    first, places = errors[0], []
+    for error in errors:
+        place, kind = error["loc"], error["type"]
+        # That of an error in one of the types that a place takes ends with the type.
+        of_type = kind != "extra_forbidden" and place and place[-1] in _TYPES
+        places.append(place[:-1] if of_type else place)
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_uncapitalise(first['msg'])})"
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
-    messages = dict.fromkeys(
-        _uncapitalise(error["msg"])
-        for error, place in zip(errors, places, strict=True)
-        if place == places[0]
-    )
+    same = zip(errors, places, strict=True)
+    messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
     value = json.dumps(first.get("input"), default=str)
     value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
     actual = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
@@ -252,7 +247,7 @@ class RowRewards:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
             try:
-                with explain_errors(connection, (table,), source):
+                with explain_errors(connection, (table,)):
                     sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
                     query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
                     values = [row[0] for row in connection.sql(query).fetchall()]

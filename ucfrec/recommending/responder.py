@@ -18,7 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.recommending.recommend import Chooser, candidate_numbers, name_some
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, id_array
-from ucfrec.runs.promoted import POINTER, promoted
+from ucfrec.runs.promoted import POINTER, Promoted, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TORCH: Final = "torch"
@@ -218,15 +218,6 @@ class Responder:
             yield Answer(items, logs, chances, question.request_id, *self._source)
 
 
-class _Current(NamedTuple):
-    """What the pointer file says, and when it was written: a run is tried again once it is promoted
-    again."""
-
-    name: str
-    fingerprint: str
-    written_ns: int
-
-
 class _Arm(NamedTuple):
     """A run with its share of the users."""
 
@@ -282,11 +273,13 @@ class Served:
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._refused: tuple[str, str] | None = None
-        self._known: _Current | None = None
+        self._known: tuple[Promoted, int] | None = None
         if shares is None:
-            self._known = self._current()
-            shares = {self._known.name: 1.0}
+            pointer, _ = self._known = self._current()
+            shares = {pointer.current: 1.0}
         self._arms = [_Arm(name, share, make(folder / name)) for name, share in shares.items()]
+        if self._known is not None:
+            pointer.require_same(self.trained)
         for arm in self._arms[1:]:
             _require_alike(arm.responder.trained, self.trained)
 
@@ -337,12 +330,12 @@ class Served:
         current = self._current()
         if current == self._known:
             return
-        self._known = current
-        same_run = current.fingerprint in ("", self.trained.fingerprint)
-        if current.name == self._arms[0].name and same_run:
+        self._known, (pointer, _) = current, current
+        same_run = pointer.fingerprint in ("", self.trained.fingerprint)
+        if pointer.current == self._arms[0].name and same_run:
             self._refused = None
         else:
-            self._replace(current.name)
+            self._replace(pointer)
 
     def follow(self, seconds: float = SECONDS) -> None:
         """Look every so many seconds whether another run is current, in a thread of its own."""
@@ -358,15 +351,17 @@ class Served:
             for arm in self._arms:
                 arm.responder.close()
 
-    def _current(self) -> _Current:
+    def _current(self) -> tuple[Promoted, int]:
+        """What the pointer file says, and when it was written: a run is tried again once it is
+        promoted again."""
         pointer = promoted(self._folder)
         if pointer is None:
             raise InputError(
                 f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
                 "or ucfrec promote one"
             )
-        written = (self._folder / POINTER).stat().st_mtime_ns
-        return _Current(pointer.run(self._folder).name, pointer.fingerprint, written)
+        pointer.run(self._folder)
+        return pointer, (self._folder / POINTER).stat().st_mtime_ns
 
     def _run(self, seconds: float) -> None:
         previous = ""
@@ -382,11 +377,12 @@ class Served:
                 _say(message)
             previous = message
 
-    def _replace(self, name: str) -> None:
+    def _replace(self, pointer: Promoted) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""
-        began = time.perf_counter()
+        began, name = time.perf_counter(), pointer.current
         try:
             responder = self._make(self._folder / name)
+            pointer.require_same(responder.trained)
             _require_alike(responder.trained, self.trained)
             (outcome,) = responder.answers([Request(user_id="")])
             if isinstance(outcome, InputError) and not responder.trained.record.observation_size:

@@ -5,6 +5,7 @@ uvicorn's own supervisor starts a worker that cannot start again and again, or g
 reason; and its workers outlive a parent that is killed.
 """
 
+import asyncio
 import os
 import socket
 import sys
@@ -13,13 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.processes import Interrupted, block_ctrl_c, interruptions_raised
@@ -31,15 +34,88 @@ MOST: Final = 256
 _PAUSE: Final = 10.0
 """Seconds after which a worker that could not start is tried again."""
 _SPAWN: Final = get_context("spawn")
+_SPARE: Final = 192
+"""Files that connections leave to the process."""
+_AT_ONCE: Final = 128
+"""Connections that are accepted before any is looked at, for which the spare files suffice."""
+_BACKLOG: Final = 2048
+"""Connections that wait to be accepted."""
+_TOO_MANY: Final = (
+    b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nRetry-After: 1\r\n"
+    b"Content-Length: 0\r\n\r\n"
+)
 
 
-def server_config(application: Any, **more: Any) -> uvicorn.Config:
-    """How `application` is served; `more` goes to uvicorn."""
-    # h11 takes one request of a connection after the other and bounds what it keeps of a head;
-    # httptools does neither, and saves 5% of the processor time at most.
+class _Connection(H11Protocol):
+    """A connection, which ends if its client takes too long, or has too many others.
+
+    h11 takes one request of a connection after the other and bounds what it keeps of a head;
+    httptools does neither, and saves 5% of the processor time at most.
+    """
+
+    def __init__(self, seconds: float, most: int, of_address: int, *server: Any, **named: Any):
+        super().__init__(*server, **named)
+        self._seconds, self._most, self._of_address = seconds, most, of_address
+        self._before: tuple[object, int] | None = None
+        self._timer = self.loop.call_later(seconds, self._check)
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        others: Any = self.connections
+        same = sum(other.client[0] == self.client[0] for other in others) if self.client else 0
+        if len(others) > self._most or same > self._of_address:
+            transport.write(_TOO_MANY)
+            transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._timer.cancel()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._timer.cancel()
+        self._timer = self.loop.call_later(self._seconds, self._check)
+
+    def _check(self) -> None:
+        """End the connection if no head has come since it began or was answered; or if, since the
+        last check, nothing of an answer was taken, or the body of a request has not become
+        whole."""
+        cycle, unsent = self.cycle, self.transport.get_write_buffer_size()
+        before, self._before = self._before, (cycle, unsent)
+        idle = not unsent and (cycle is None or cycle.response_complete)
+        if idle or (before == self._before and (unsent or cycle.more_body)):
+            self.transport.abort()
+        else:
+            self._timer = self.loop.call_later(self._seconds, self._check)
+
+
+def server_config(
+    application: Any,
+    seconds: float = 5.0,
+    connections: int = 1024,
+    of_address: int = 512,
+    **more: Any,
+) -> uvicorn.Config:
+    """How `application` is served; `more` goes to uvicorn.
+
+    Args:
+        seconds: a connection is closed after so long without a head, and after at most twice as
+            long without the whole body, or while nothing of the answer is taken.
+        connections: most that are open; where the process may not open so many files, as many as
+            it may, less some, and half of them for each address.
+        of_address: most of them that one address has.
+    """
+    if sys.platform != "win32":
+        import resource
+
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        if files != resource.RLIM_INFINITY and files - _SPARE < connections:
+            connections = max(2, files - _SPARE)
+            of_address = min(of_address, connections // 2)
     return uvicorn.Config(
         application,
-        http="h11",
+        http=partial(_Connection, seconds, connections, of_address),  # type: ignore[arg-type]
+        backlog=_AT_ONCE,
         h11_max_incomplete_event_size=2**16,
         ws="none",
         access_log=False,
@@ -85,6 +161,7 @@ class Server(uvicorn.Server):
         """Start to listen."""
         await super().startup(sockets)
         for bound in sockets or []:
+            bound.listen(_BACKLOG)
             self._ready(bound)
 
 
@@ -93,13 +170,6 @@ class PrintingServer(Server):
 
     def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
         super().__init__(config, lambda at: print(ready_line(what, at, page), flush=True))
-
-
-class _Ends(Protocol):
-    """What `uvicorn.Server` is ended by."""
-
-    should_exit: bool
-    force_exit: bool
 
 
 class Parent:
@@ -113,26 +183,21 @@ class Parent:
         self.first = first
         """Whether this is the one of the workers that says what all would say."""
         self._connection, self._lock = connection, threading.Lock()
-        self._server: _Ends | None = None
+        self._server: uvicorn.Server | None = None
         self._closed, self._close = get_context().Pipe(duplex=False)
         self._thread = threading.Thread(target=self._watch, name="parent", daemon=True)
         self._thread.start()
 
-    def ends(self, server: _Ends) -> None:
+    def ends(self, server: uvicorn.Server) -> None:
         """From now on the parent ends a server; before, it ends the process, which serves no one
         yet."""
         with self._lock:
             self._server = server
 
-    def ready(self, what: str) -> None:
-        """Report that the worker answers, and with what."""
+    def report(self, news: Literal["ready", "failed"], text: str) -> None:
+        """Report that the worker answers, and with what; or what failed."""
         with suppress(OSError):  # the parent has ended
-            self._connection.send(("ready", what))
-
-    def failed(self, why: str) -> None:
-        """Report why the worker cannot start."""
-        with suppress(OSError):
-            self._connection.send(("failed", why))
+            self._connection.send((news, text))
 
     def close(self) -> None:
         """End the thread that listens to the parent: Python ends in order only without it."""
@@ -224,13 +289,18 @@ class Workers:
                 self._start()
 
     def end(self) -> None:
-        """End the workers after the requests in flight, or at once when interrupted meanwhile."""
+        """End the workers after the requests in flight, or at once when interrupted meanwhile;
+        InputError with what failed in them at the end."""
         self._listening.close()
         try:
             self._ask_and_wait()
         except Interrupted:
             self._ask_and_wait()
+        begun = [worker for worker in self._workers if worker.process.pid is not None]
+        failures = dict.fromkeys(each.failure for each in begun if each.receive() == "failed")
         self._workers.clear()
+        if failures:
+            raise InputError("; ".join(failures))
 
     def _ask_and_wait(self) -> None:
         for worker in self._workers:

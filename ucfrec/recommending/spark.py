@@ -1,18 +1,16 @@
 """Recommend next items to the users of a log with Apache Spark, for users of any number."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-import pandas as pd
+from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
-from ucfrec.logs.histories import Histories, read_histories
+from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
@@ -20,7 +18,6 @@ from ucfrec.recommending.histories import session_by
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy
-from ucfrec.settings import require_whole
 
 
 def recommend_with_spark(
@@ -34,12 +31,8 @@ def recommend_with_spark(
     exposures: Path | None = None,
     checkpoint: str = "best",
     rule: DecisionRule | None = None,
-    filter_seen: bool = True,
-    skip_unknown: bool = False,
-    new_session: bool = False,
-    at: str | float | None = None,
-    seed: int = 0,
     memory_limit: str = "2GB",
+    **how: Any,
 ) -> int:
     """Write the `k` best next items of every user of logs, as `recommend` finds them; returns their
     number.
@@ -52,61 +45,42 @@ def recommend_with_spark(
         exposures: folder for what was shown; None for none.
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
+        how: `filter_seen`, `skip_unknown`, `new_session` and `seed` of `recommend`.
 
     Raises:
         InputError: an argument or the logs cannot be used, or Spark is missing or fails.
     """
-    rule = rule or trained.rule
-    trained.item_scorer(rule)
-    require_whole("k", k)
+    recommended: Any = partial(recommend, k=k, rule=rule or trained.rule, **how)
+    recommended(trained, ())  # checks the arguments
     columns = columns_used(trained, mapping)
     log = UserLog(files, columns, reward_of(trained), session_by(trained))
     with ExitStack() as stack:
         folders = [out] if exposures is None else [out, exposures]
         parts = [stack.enter_context(atomic_folder(folder)).absolute() for folder in folders]
-        recommended = partial(
-            recommend,
-            k=k,
-            rule=rule,
-            filter_seen=filter_seen,
-            skip_unknown=skip_unknown,
-            new_session=new_session,
-            at=at,
-            seed=seed,
-        )
-        exposed = None if exposures is None else parts[1]
         run = RunOnWorkers(trained.folder.absolute(), checkpoint, trained.fingerprint)
-        part = _RecommendPart(run, parts[0], exposed, memory_limit, rule.hash, recommended)
-        return sum(map_users(log, parts[0].parent, master, part))
+        work = partial(_recommend_part, run, parts, memory_limit, recommended)
+        return sum(map_users(log, parts[0].parent, master, work))
 
 
-@dataclass(frozen=True)
-class _RecommendPart:
-    """Recommends to the users of a part, see `ucfrec.logs.spark.Work`."""
-
-    run: RunOnWorkers
-    out: Path
-    exposures: Path | None
-    memory_limit: str
-    rule: str
-    """Hash of the decision rule."""
-    recommend: Callable[[TrainedPolicy, Iterable[Histories]], Iterator[pd.DataFrame]]
-
-    def __call__(self, part: int, rows: Path, mapping: LogMapping) -> int:
-        """Write the files of a part; returns the number of recommended items."""
-        trained, name = self.run.load(), part_name(part)
-        histories = read_histories(
-            [rows],
-            mapping,
-            "reward",
-            LONGEST_HISTORY,
-            self.memory_limit,
-            session_by(trained),
-            trained.record.data.duplicates,
-        )
-        frames = self.recommend(trained, histories)
-        with ExitStack() as stack:
-            if self.exposures is not None:
-                arguments = self.exposures / name, trained, self.rule, frames
-                frames = stack.enter_context(exposures_written(*arguments))
-            return write_frames(self.out / name, frames)
+def _recommend_part(
+    run: RunOnWorkers,
+    folders: Sequence[Path],
+    memory_limit: str,
+    recommended: Any,
+    part: int,
+    rows: Path,
+    mapping: LogMapping,
+) -> int:
+    """Write the files of a part; returns the number of recommended items. A worker calls it
+    (`ucfrec.logs.spark.Work`)."""
+    trained, (out, *shown) = run.load(), (folder / part_name(part) for folder in folders)
+    by, duplicates = session_by(trained), trained.record.data.duplicates
+    histories = read_histories(
+        [rows], mapping, "reward", LONGEST_HISTORY, memory_limit, by, duplicates
+    )
+    frames = recommended(trained, histories)
+    with ExitStack() as stack:
+        for path in shown:
+            rule = recommended.keywords["rule"].hash
+            frames = stack.enter_context(exposures_written(path, trained, rule, frames))
+        return write_frames(out, frames)

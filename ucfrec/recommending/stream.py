@@ -1,9 +1,8 @@
 """Recommendations as a stream: lines of requests in, lines of answers out."""
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import IO, Any, Final, Protocol
+from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
@@ -18,20 +17,6 @@ _AT_ONCE: Final = 256
 """Most requests of a forward pass."""
 
 
-class Readable(Protocol):
-    """A file that gives what there is, such as an unbuffered pipe."""
-
-    def read(self, size: int, /) -> bytes | None: ...
-
-
-@dataclass
-class Counts:
-    """What a stream has answered."""
-
-    answers: int = 0
-    errors: int = 0
-
-
 _Line = tuple[int, bytes | None]
 """Number of a line, from 1, and what it holds; None if it is too long."""
 _Read = tuple[int, StreamRequest | InputError]
@@ -40,28 +25,27 @@ _Read = tuple[int, StreamRequest | InputError]
 
 def answer_stream(
     responder: Responder,
-    source: Readable,
+    source: IO[bytes],
     sink: IO[bytes],
     remember: int = REMEMBERED,
     exposures: ExposureLog | None = None,
-) -> Counts:
+) -> Counter[str]:
     """Answer every line of `source` until it ends: the nth answer is that of the nth line.
 
     What has arrived is answered with one forward pass, and each answer is written at once. A line
     that is not a request, a blank one too, is answered with `{"error": …, "line": …}`, and the
-    stream goes on.
+    stream goes on. Returns the numbers of `answers` and `errors`.
 
     Args:
-        source: lines of JSON, UTF-8; see `ucfrec.recommending.requests.StreamRequest`.
+        source: lines of JSON, UTF-8, unbuffered; see `ucfrec.recommending.requests.StreamRequest`.
         remember: rows that are remembered, of all users together.
         exposures: gets every answer; None for none.
     """
-    counts, remembered = Counts(), _Remembered(remember, responder.limits)
+    counts, remembered = Counter[str](), _Remembered(remember, responder.limits)
     for lines in _read_lines(source, responder.limits.bytes):
         for answer in _answer(responder, remembered, lines, exposures):
             sink.write(json_text(answer).encode() + b"\n")
-            counts.errors += "error" in answer
-            counts.answers += "error" not in answer
+            counts["errors" if "error" in answer else "answers"] += 1
         sink.flush()
     return counts
 
@@ -148,7 +132,7 @@ class _Remembered:
             self._count -= len(self._rows.popitem(last=False)[1])
 
 
-def _read_lines(source: Readable, most: int) -> Iterator[list[_Line]]:
+def _read_lines(source: IO[bytes], most: int) -> Iterator[list[_Line]]:
     """Lines that arrive together; None for one of over `most` bytes."""
     number, buffer, too_long = 0, bytearray(), False
     while block := source.read(_BLOCK):

@@ -78,7 +78,11 @@ class ServerLimits:
     queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1024
     """Requests that may wait."""
     timeout: Annotated[float, Field(gt=0, le=3600)] = 5.0
-    """Seconds for a request to arrive and to be answered."""
+    """Seconds for the head of a request to arrive, and then for it to be answered."""
+    connections: Annotated[int, Field(ge=1, le=1_000_000)] = 1024
+    """Open connections of each process; at most the files that it may open, less 192."""
+    connections_of_address: Annotated[int, Field(ge=1, le=1_000_000)] = 512
+    """Of these, connections of one address, for a proxy as many as of all."""
 
 
 class _Error(TypedDict):

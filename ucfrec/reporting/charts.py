@@ -249,8 +249,8 @@ def render(figure: "Figure", title: str, summary: str) -> Chart:
 # Figures that are files: colors and the column widths of a paper.
 COLUMN, PAGE = 3.4, 7.0
 """Widths of one column and of the whole page, in inches."""
-PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
-"""Colors of other methods, of UCF, and of a third bar."""
+PLAIN, OURS = "#8C8C8C", "#D55E00"
+"""Colors of other methods, and of UCF."""
 _NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
 
 _FILE_STYLE: Final[Any] = {

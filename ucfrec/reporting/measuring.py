@@ -1,7 +1,7 @@
 """What `rank`, `ope` and `evaluate` do, as commands and as methods of `Recommender`: measure, and
 add each result to the model card of its run. Each imports only what it needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +32,7 @@ def rank_policies(
     filter_seen: bool,
     liked: str | None,
     seed: int,
-    checkpoint: str,
+    checkpoint: str = "best",
 ) -> Ranking:
     """Rank what users were shown later, by policies of one store and by baselines.
 
@@ -83,7 +83,7 @@ def estimate_return(
     *,
     options: "EstimateOptions",
     seed: int,
-    checkpoint: str,
+    checkpoint: str = "best",
 ) -> "OffPolicyReport":
     """Estimate the return of a session from logs, or from the files that `score` made of them.
 
@@ -114,14 +114,14 @@ def estimate_return(
 
 def evaluate_in(
     environment: "Environment",
-    candidates: Mapping[Path, Candidate],
+    candidates: Sequence[Candidate],
     behaviors: Sequence[str],
     *,
     episodes: int,
     seed: int,
-    checkpoint: str,
+    checkpoint: str = "best",
 ) -> Evaluation:
-    """Measure the return of policies, by run folder, and of built-in policies in a simulator.
+    """Measure the return of policies and of built-in policies in a simulator.
 
     Raises:
         InputError: a policy does not fit the environment, or it has no such behavior.
@@ -129,9 +129,9 @@ def evaluate_in(
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 
     rows = []
-    for run, (trained, rule) in candidates.items():
+    for trained, rule in candidates:
         row = evaluate_policy(environment, trained, trained.name, episodes, seed, rule)
-        conditions = {**row.conditions, "run": shorten_paths(str(run))}
+        conditions = {**row.conditions, "run": shorten_paths(str(trained.folder))}
         rows.append(replace(row, conditions=conditions, checkpoint=checkpoint))
         add_evaluation(trained.folder, rows[-1])
     rows += [evaluate_behavior(environment, name, episodes, seed) for name in behaviors]

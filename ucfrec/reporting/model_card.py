@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.errors import damage_explained
 from ucfrec.files.atomic import atomic_file, claim, read_json, write_json
 from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.checkpoint import read_metrics
@@ -33,7 +34,10 @@ def write_card(run: Path) -> Path:
     """
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
-    fit = record.policy
+    fit, window = record.policy, _training_window(record, refitted)
+    data = describe_data(record) | {"reward": f"`{record.reward}`"}
+    if window is not None:
+        data["training window (UTC)"] = " to ".join(map(_format_day, window))
     parts = [
         f"# Model card: {record.name}",
         _tabulate(
@@ -47,7 +51,7 @@ def write_card(run: Path) -> Path:
             }
         ),
         "## Training data",
-        _describe_data(record, refitted),
+        _tabulate(data),
         "## How it acts",
         _describe_rule(run, record),
         "## Limits",
@@ -129,25 +133,41 @@ def _select_values(
 
 
 def _read_measured(run: Path) -> list[dict[str, Any]]:
-    return list(read_json(run / MEASURED)) if (run / MEASURED).exists() else []
+    file = run / MEASURED
+    with damage_explained(file, "restore or remove it"):
+        return [
+            {
+                "how": row["how"],
+                "of": row["of"],
+                "values": {**row["values"]},
+                "said": [*row["said"]],
+            }
+            for row in (read_json(file) if file.exists() else ())
+        ]
 
 
-def _describe_data(record: RunRecord, refitted: bool) -> str:
-    window = _training_window(record, refitted)
-    rows = {
+def describe_data(record: RunRecord) -> dict[str, object]:
+    """What a run was trained on."""
+    sizes = record.sizes
+    rows: dict[str, object] = {
         "files": ", ".join(PurePath(file).name for file in record.data.files) or None,
-        "training window (UTC)": None if window is None else " to ".join(map(_format_day, window)),
-        "reward": f"`{record.reward}`",
+        "fingerprint": record.fingerprint[:12],
+        "reward": record.reward,
         "sessions by": record.session_by,
         "training sessions": record.train_episodes,
         "training steps": record.train_steps,
         "users": record.data.users,
-        "items": record.sizes["items"] or None,
+        "actions": f"{sizes['items']:,} items" if sizes["items"] else f"{sizes['action']} numbers",
+        "state dimensions": sizes["state"],
         "mean return of a session": record.mean_return,
-        "largest return of a session": record.return_quantiles.get("1.0"),
-        "fingerprint": record.fingerprint[:12],
     }
-    return _tabulate(rows)
+    for level, value in record.return_quantiles.items():
+        rows[f"{float(level):.0%} of returns are at most"] = value
+    for name, tables in record.data.feature_tables.items():
+        for file, kinds in tables.items():
+            columns = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+            rows[f"{name} features in {file}"] = columns or "no columns"
+    return {name: value for name, value in rows.items() if value is not None}
 
 
 def _training_window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:

@@ -7,15 +7,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
 from ucfrec.counterfactual.augmentation import AugmentationReport
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.checkpoint import read_metrics
-from ucfrec.reporting.model_card import tabulate_user_model
+from ucfrec.logs.summary import format_report
+from ucfrec.reporting.model_card import describe_data, tabulate_user_model
 from ucfrec.reporting.results import (
     conclude,
     draw_environments,
@@ -35,7 +37,6 @@ from ucfrec.reporting.training import (
     read_features,
     select_curves,
     tabulate_augmentation,
-    tabulate_rows,
     tabulate_samples,
 )
 from ucfrec.results.statistics import grouped
@@ -79,8 +80,6 @@ def write_report(
     Raises:
         InputError: `out` is a folder, or as `render_report`.
     """
-    if out.is_dir():
-        raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
     page = render_report(runs, results, items)
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.
@@ -99,7 +98,8 @@ def render_report(
     Raises:
         InputError: a folder is not a run, or a file has no such rows or features.
     """
-    by_data = grouped(_read_runs(runs), lambda run: run.record.fingerprint)
+    read = _read_runs(runs)
+    by_data = grouped(read, lambda run: run.record.fingerprint)
     environments, estimates = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
@@ -108,7 +108,7 @@ def render_report(
             "estimates": draw_estimates(estimates),
             "forest": draw_forest(estimates),
         }
-    features = None if items is None else read_features(items)
+    features = None if items is None else read_features(items, [run.record.data for run in read])
     warnings, sections = [], []
     for group in by_data.values():
         for run in group:
@@ -177,7 +177,8 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     return {
         "names": names,
         "store": record.store,
-        "data": [_tabulate_data(record), *tabulate_rows(record.data)],
+        "data": Table.of_columns("Training data", {"value": describe_data(record)}),
+        "rows": format_report(record.data.model_dump()) if record.data.rows_read else "",
         "pictures": pictures,
         "quantiles": quantiles,
         "summary": _summarise(runs),
@@ -194,22 +195,6 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
-
-
-def _tabulate_data(record: RunRecord) -> Table:
-    sizes = record.sizes
-    rows: dict[str, object] = {
-        "fingerprint": record.fingerprint[:12],
-        "reward": record.reward,
-        "training sessions": record.train_episodes,
-        "training steps": record.train_steps,
-        "actions": f"{sizes['items']:,} items" if sizes["items"] else f"{sizes['action']} numbers",
-        "state dimensions": sizes["state"],
-        "mean return of a session": record.mean_return,
-    }
-    for level, value in record.return_quantiles.items():
-        rows[f"{float(level):.0%} of returns are at most"] = value
-    return Table.of_columns("Training data", {"value": rows})
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
@@ -231,13 +216,7 @@ def _summarise(runs: Sequence[_Run]) -> Table:
 
 def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    settings: dict[str, list[object]] = {}
-    for number, run in enumerate(runs):
-        for table, fields in {**run.record.settings, "version": run.record.versions}.items():
-            flat = {table: fields}
-            if isinstance(fields, dict) and fields:
-                flat = {f"{table}.{field}": value for field, value in fields.items()}
-            for name, value in flat.items():
-                settings.setdefault(name, [None] * len(runs))[number] = value
-    rows = [(n, values) for n, values in settings.items() if any(v != values[0] for v in values)]
+    settings = [{**run.record.settings, "version": run.record.versions} for run in runs]
+    columns = pd.json_normalize(settings, max_level=1).to_dict("list").items()
+    rows = [(str(n), values) for n, values in columns if any(v != values[0] for v in values)]
     return Table("Settings that differ", [run.name for run in runs], rows) if rows else None

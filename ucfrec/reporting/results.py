@@ -221,12 +221,11 @@ class _Return:
     high: float
     """Lowest and highest end of the rows' 95% intervals."""
 
-    def above(self, reference: "_Return") -> bool:
-        """Whether all intervals are above all intervals of `reference`."""
-        return self.low > reference.high
-
     def __str__(self) -> str:
         return f"{self.policy} ({format_value(self.value)})"
+
+
+_VERDICTS = {1: "Higher", -1: "Lower", 0: "Open, as intervals overlap"}
 
 
 def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> list[str]:
@@ -243,53 +242,29 @@ def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
         name = policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}"
         seeds = {row.training_seed for row in group}
         value = sum(row.value for row in group) / len(group)
-        lows = [row.interval[0] for row in group if row.interval]
-        highs = [row.interval[1] for row in group if row.interval]
-        trained = seeds != {None}
-        returns.append(_Return(name, trained, len(seeds), value, min(lows), max(highs)))
+        lows, highs = zip(*(row.interval for row in group if row.interval), strict=True)
+        returns.append(_Return(name, seeds != {None}, len(seeds), value, min(lows), max(highs)))
     return returns
 
 
 def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
-    returns = _collect_returns(rows)
-    trained = sorted((policy for policy in returns if policy.trained), key=lambda p: -p.value)
-    references = [policy for policy in returns if not policy.trained]
+    """The best trained policy, and how the others compare: all intervals with all intervals."""
+    returns = sorted(_collect_returns(rows), key=lambda own: (-own.trained, -own.value))
+    (best, *others), trained = returns, sum(own.trained for own in returns)
     if not trained:
-        return f"In {environment}, only built-in policies were evaluated: {_join(references)}."
-    best, *lower = trained
-    ends = f"{format_value(best.low)} to {format_value(best.high)}"
-    of = f"(95% interval {ends})"
-    if best.trainings > 1:
-        of = f"in the mean of {best.trainings} trainings (their 95% intervals span {ends})"
-    rank = f"the highest return of {len(trained)} trained policies:" if lower else "a return of"
+        names = ", ".join(map(str, returns))
+        return f"In {environment}, only built-in policies were evaluated: {names}."
     text = (
-        f"In {environment}, {best.policy} has {rank} {format_value(best.value)} {of} per episode."
+        f"In {environment}, {best} has the highest return per episode of {trained} trained (95% "
+        f"intervals {format_value(best.low)} to {format_value(best.high)}; trainings: "
+        f"{best.trainings})."
     )
-    if close := [policy for policy in lower if not best.above(policy)]:
-        text += f" Its interval overlaps that of {_join(close)}: which of them has the higher "
-        text += "return is open."
-    elif lower:
-        text += f" Its interval lies above those of the others, the next being {lower[0]}."
-    text += _compare(best, references)
-    if max(policy.trainings for policy in trained) < 2:
-        once = "Each policy was" if lower else "It was"
-        text += f" {once} trained once; the spread over training seeds is unknown."
-    return text
-
-
-def _compare(best: _Return, references: Sequence[_Return]) -> str:
-    """Compare the best trained policy with the built-in policies."""
-    if not references:
-        return " No built-in policy (random, logging or best) was evaluated to compare it with."
-    below = [policy for policy in references if best.above(policy)]
-    above = [policy for policy in references if policy.above(best)]
-    unclear = [policy for policy in references if policy not in (*above, *below)]
-    groups = {"higher": below, "lower": above}
-    parts = [f"{word} than that of {_join(group)}" for word, group in groups.items() if group]
-    text = f" Its return is {', and '.join(parts)}." if parts else ""
-    if unclear:
-        text += f" Whether it is higher or lower than that of {_join(unclear)} is open: intervals "
-        text += "overlap."
+    groups = grouped(others, lambda own: _VERDICTS[(own.low > best.high) - (own.high < best.low)])
+    text += "".join(f" {words}: {', '.join(map(str, own))}." for words, own in groups.items())
+    if trained == len(returns):
+        text += " No built-in policy (random, logging or best) was evaluated to compare it with."
+    if best.trainings < 2:
+        text += " It was trained once; the spread over training seeds is unknown."
     return text
 
 
@@ -299,9 +274,3 @@ def _quote(estimates: Estimates) -> str:
         if verdict := row.details.get("verdict"):
             return f"For {estimates.name}: {verdict}."
     return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
-
-
-def _join(policies: Sequence[_Return]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
-    *names, last = map(str, policies)
-    return f"{', '.join(names)} and {last}" if names else last

@@ -1,7 +1,7 @@
 """What the report shows of a training: quality of the data, curves, augmentation and samples."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,6 @@ from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json, require_file
-from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
 from ucfrec.runs.run import SAMPLES
@@ -51,39 +50,6 @@ _DISTRIBUTIONS: Final = {
 _MOST_CHARACTERS: Final = 120
 """Most characters of the shown features of an item."""
 _LEVELS: Final = ("0", "0.25", "0.5", "0.75", "0.99", "1")
-_COUNTS: Final = {
-    "rows_read": "rows read",
-    "unsorted_rows": "rows out of order (sorted)",
-    "equal_times": "rows at equal times (in no order that could be learned)",
-    "steps": "steps kept",
-    "users": "users",
-    "items": "items",
-    "sessions": "sessions",
-    "sessions_cut": "sessions cut at a split",
-    "unknown_propensities": "steps with an unknown propensity",
-}
-_REASONS: Final = {
-    **REASONS,
-    "long_session": "its session, or the part of it in one split, is too long",
-    "short_episode": "its session, or the part of it in one split, is too short",
-}
-
-
-def tabulate_rows(source: Source) -> list[Table]:
-    """Tables of the rows that `prepare` read and dropped; none of a store that it did not make."""
-    total = source.rows_read
-    if total is None:
-        return []
-    values = {name: getattr(source, key) for key, name in _COUNTS.items()}
-    counts = {name: value for name, value in values.items() if value is not None}
-    dropped = []
-    for reason, rows in source.dropped.items():
-        name = f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}"
-        dropped.append((name, [rows, f"{rows / total:.2%}" if total else None]))
-    return [
-        Table.of_columns("Rows of the logs", {"count": counts}),
-        Table("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
-    ]
 
 
 def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table | None]:
@@ -91,7 +57,7 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
     pictures, quantiles = [], []
     for name, (title, x_label) in _DISTRIBUTIONS.items():
         values = source.summary.get(name)
-        if values is None or source.rows_read is None:
+        if values is None:
             continue
         quantiles.append((title, [values.quantiles.get(level) for level in _LEVELS]))
         if total := sum(values.counts):
@@ -207,7 +173,6 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
-    require_file(run / ITEMS, "restore it")
     with damage_explained(run / SAMPLES, "restore it or train again"):
         sessions = samples["sessions"]
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
@@ -216,24 +181,31 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
         return str(samples["rule"]), tables
 
 
-def read_features(path: Path, text_ids: bool = False) -> pa.Table:
-    """Read item features with a column `item_id` from CSV (file name `.csv`), whose ids may stay as
-    they are written, or Parquet.
+def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = False) -> pa.Table:
+    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
+
+    Args:
+        logs: of runs; their own name of the column is accepted in the file, too.
+        text_ids: whether ids in CSV stay as they are written.
 
     Raises:
         InputError: the file cannot be read as that or lacks the column.
     """
     require_file(path, "name another file")
+    mapped = (log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID for log in logs)
+    names = dict.fromkeys((schema.ITEM_ID, *(name.strip('"') for name in mapped)))
     try:
-        types = csv.ConvertOptions(column_types={schema.ITEM_ID: pa.string()} if text_ids else None)
+        texts = dict.fromkeys(names, pa.string()) if text_ids else None
+        types = csv.ConvertOptions(column_types=texts)
         text = path.suffix == ".csv"
         table = csv.read_csv(path, convert_options=types) if text else pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path} cannot be read as Parquet or CSV: {reason}") from None
-    if schema.ITEM_ID not in table.column_names:
-        raise InputError(f"{path} has no column {schema.ITEM_ID!r}; add one with the item ids")
-    return table
+        raise InputError(f"{path} cannot be read as Parquet or CSV: {error}") from None
+    column = next((name for name in names if name in table.column_names), None)
+    if column is None:
+        wanted = " or ".join(map(repr, names))
+        raise InputError(f"{path} has no column {wanted}; add one with the item ids")
+    return table.rename_columns({column: schema.ITEM_ID})
 
 
 def _item_cells(

@@ -3,8 +3,7 @@ of JSON in files that several processes may append to, and a table in Python."""
 
 import json
 import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -17,14 +16,11 @@ from pydantic import AfterValidator, AllowInfNan, ConfigDict, Strict, TypeAdapte
 
 from ucfrec.errors import InputError
 from ucfrec.files import atomic
-from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-CONFIGURATIONS: Final = "configurations.jsonl"
-"""File next to the rows with each of their configurations, by hash."""
 Text = Annotated[str, Strict()]
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Whole = Annotated[int, Strict()]
@@ -76,7 +72,7 @@ class RowKey:
     conditions: Mapping[Text, Scalar] = field(default_factory=dict)
     """Other settings of the measurement: budget, episodes, distractor, …"""
     config_hash: Text | None = None
-    """Hash of the training configuration, which `configurations.jsonl` holds."""
+    """Hash of the training configuration, which the run's record holds."""
     data_fingerprint: Text | None = None
     """Fingerprint of the store."""
 
@@ -164,22 +160,24 @@ _NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
 _ROWS: Final = TypeAdapter(ResultRow)
 
 
-def row_from_json(value: object, where: str) -> ResultRow:
+def row_from_json(
+    value: Any, where: str, validate: Callable[[Any], ResultRow] = _ROWS.validate_python
+) -> ResultRow:
     """Inverse of `ResultRow.to_json`; messages name the origin `where` (file and line).
 
     Raises:
         InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
     """
     try:
-        row = _ROWS.validate_python(value)
+        row = validate(value)
+        fault = "" if row.metric in row.metrics else f"its metrics lack {row.metric!r:.60}"
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise InputError(f"{where} is not a result row: {place!r:.60}: {first['msg']}") from None
+        fault = f"{'.'.join(map(str, first['loc']))!r:.60}: {first['msg']}"
     except RecursionError:
-        raise InputError(f"{where} is not a result row: it is nested too deeply") from None
-    if row.metric not in row.metrics:
-        raise InputError(f"{where} is not a result row: its metrics lack {row.metric!r:.60}")
+        fault = "it is nested too deeply"
+    if fault:
+        raise InputError(f"{where} is not a result row: {fault}; delete it, or name another file")
     return row
 
 
@@ -189,7 +187,12 @@ def read_rows(path: Path) -> list[ResultRow]:
     Raises:
         InputError: a line is not a result row, or the file is not UTF-8 text.
     """
-    return [row_from_json(value, f"{path}, line {n}") for n, value in _read_lines(path)]
+    lines = enumerate(_read_text(path).split("\n"), start=1)
+    return [
+        row_from_json(line, f"{path}, line {number}", _ROWS.validate_json)
+        for number, line in lines
+        if line.strip()
+    ]
 
 
 def read_results(path: Path) -> list[ResultRow]:
@@ -213,56 +216,22 @@ def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
     atomic.write_json(path, [row.to_json() for row in rows])
 
 
-def _read_lines(path: Path) -> list[tuple[int, object]]:
-    """(line number, JSON value) of every line that is not blank; none if there is no file."""
-    values: list[tuple[int, object]] = []
-    try:
-        lines = path.read_text(encoding="utf-8").split("\n") if path.exists() else []
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not UTF-8 text; name a file of result rows") from None
-    for number, line in enumerate(lines, start=1):
-        try:
-            if line.strip():
-                values.append((number, json.loads(line)))
-        except (ValueError, RecursionError):
-            raise InputError(
-                f"{path}, line {number} is not a result row; delete the line to measure it again"
-            ) from None
-    return values
-
-
-def append_rows(
-    path: Path, rows: Sequence[ResultRow], config: Mapping[str, Any] | None = None
-) -> None:
-    """Append rows to a file, and their configuration to `configurations.jsonl` next to it.
-
-    Atomic: after an interruption either all rows are in the file or none. Other processes that
-    append to a file of the folder wait.
+def append_rows(path: Path, rows: Sequence[ResultRow]) -> None:
+    """Append rows to a file; after an interruption either all are in it or none. Other processes
+    that append to the file wait.
 
     Raises:
-        InputError: a row has a number that is not finite, or another `config_hash` than `config`.
+        ValueError: a row has a number that is not finite.
     """
-    digest = None if config is None else config_hash(config)
-    if any(row.config_hash != digest for row in rows):
-        raise InputError(f"rows for {path} have the hash of another configuration; pass their own")
-    for row in rows:
-        row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
-    configurations = path.with_name(CONFIGURATIONS)
-    with atomic.claim(configurations, wait=True):
-        written = [value for _, value in _read_lines(configurations) if isinstance(value, dict)]
-        if config is not None and digest not in [value.get("hash") for value in written]:
-            _append(configurations, [{"hash": digest, "config": config}])
     with atomic.claim(path, wait=True):
-        _append(path, [row.to_json() for row in rows])
+        _write(path, _read_text(path), rows)
 
 
 def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
     """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
     with atomic.claim(path, wait=True):
         rows = read_rows(path)
-        remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
-        if len(remaining) < len(rows):
-            _write(path, b"", [row.to_json() for row in remaining])
+        _write(path, "", [row for row in rows if not any(key.covers(row) for key in keys)])
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -284,20 +253,21 @@ def benchmarking(path: Path) -> Iterator[None]:
         yield
 
 
-def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
-    head = path.read_bytes() if path.exists() else b""
-    if head and not head.endswith(b"\n"):
-        head += b"\n"
-    _write(path, head, values)
+def _read_text(path: Path) -> str:
+    """Whole lines; none if there is no file."""
+    try:
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not UTF-8 text; name a file of result rows") from None
+    return text + "\n" if text and not text.endswith("\n") else text
 
 
-def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
+def _write(path: Path, text: str, rows: Sequence[ResultRow]) -> None:
+    """Replace a file by text and the lines of rows."""
     write = partial(json.dumps, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    text = "".join(f"{write(value)}\n" for value in values)
-    with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
-        file.write(head + text.encode())
-        file.flush()
-        os.fsync(file.fileno())
+    lines = "".join(f"{write(row.to_json())}\n" for row in rows)
+    with atomic.atomic_file(path) as scratch:
+        scratch.write_bytes((text + lines).encode())
 
 
 _ORIGIN: Final = ("config_hash", "data_fingerprint")

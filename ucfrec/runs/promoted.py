@@ -6,8 +6,6 @@ The file names the current run and those before it, the latest last.
 from pathlib import Path
 from typing import ClassVar, Final
 
-from pydantic import Field
-
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
 from ucfrec.files.record import Record, Text
@@ -15,8 +13,6 @@ from ucfrec.runs.record import RunRecord, verify_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 POINTER: Final = "promoted.json"
-_MOST: Final = 1000
-"""Earlier runs that are remembered."""
 
 
 class Promoted(Record):
@@ -30,13 +26,22 @@ class Promoted(Record):
     """Name of the run folder, beside the file."""
     fingerprint: Text = ""
     """Of the run as it was promoted; empty in a file of an earlier version."""
-    previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
+    previous: tuple[Text, ...] = ()
 
     def run(self, folder: Path) -> Path:
         """The folder of the current run; InputError if it does not lie beside the file."""
         if self.current in ("", ".", "..") or Path(self.current).name != self.current:
             raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
         return folder / self.current
+
+    def require_same(self, trained: TrainedPolicy) -> None:
+        """Check that a run of that name is the one that was promoted, or raise InputError."""
+        if self.fingerprint not in ("", trained.fingerprint):
+            raise InputError(
+                f"{trained.folder} is not the run that was promoted: {POINTER} has the fingerprint "
+                f"{self.fingerprint}, the run {trained.fingerprint}; restore that run, or "
+                "promote this one with --force"
+            )
 
 
 def promoted(folder: Path) -> Promoted | None:
@@ -65,8 +70,8 @@ def promote(run: Path, force: bool = False) -> Promoted:
             return _write(run, fingerprint, ())
         again = pointer.current == run.name
         if not force and not (again and pointer.fingerprint in ("", fingerprint)):
-            _require_verdict(run, pointer.run(folder))
-        previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
+            _require_verdict(run, pointer)
+        previous = pointer.previous if again else (*pointer.previous, pointer.current)
         # Written again too, so that a server tries again what it could not use.
         return _write(run, fingerprint, previous)
 
@@ -92,8 +97,8 @@ def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
     return pointer.write(run.parent)
 
 
-def _require_verdict(run: Path, current: Path) -> None:
-    update, fault = RunRecord.read(run).update, ""
+def _require_verdict(run: Path, pointer: Promoted) -> None:
+    update, fault, current = RunRecord.read(run).update, "", pointer.run(run.parent)
     if update is None or update.verdict is None:
         fault = f"has no verdict against the current run {current.name}"
     elif update.run != TrainedPolicy.load(current, split=True).fingerprint:
@@ -102,3 +107,4 @@ def _require_verdict(run: Path, current: Path) -> None:
         fault = f"is worse than {current.name} by its verdict"
     if fault:
         raise InputError(f"{run} {fault}; compare them, and add --force to promote it all the same")
+    pointer.require_same(TrainedPolicy.load(current))

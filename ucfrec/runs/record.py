@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import Evidence, ValueEstimate
+from ucfrec.choosing.choice import Evidence, RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.item_table import ITEM_STATES
@@ -34,7 +34,6 @@ from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
-from ucfrec.user_model.session_end import SessionEndReport
 
 _Report = TypeVar("_Report")
 RUN: Final = RUN_RECORD
@@ -114,24 +113,7 @@ class Candidate(Entry):
     rule: SavedRule
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
-    error: Number | None = None
     evidence: Evidence | None = None
-
-
-class RuleRecord(Entry):
-    """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""
-
-    model_config = ConfigDict(extra="allow")
-
-    rule: SavedRule
-    chosen_by: Text
-    warning: Text = ""
-    tried: Count = 0
-    """Number of rules in the file `CANDIDATES`."""
-    estimate: ValueEstimate | None = None
-    halves_agree: tuple[bool, bool] | None = None
-    """Whether the sessions of either half of the users would choose the rule, too."""
-    session_end: SessionEndReport | None = None
 
 
 class Difference(Entry):
@@ -390,23 +372,14 @@ def verify_run(run: Path) -> None:
 
 
 def _describe_augmentation(report: AugmentationReport) -> list[str]:
-    crm, moves, actions = report.reward_model, report.moves, report.actions
-    lines = [
-        f"reward model  R² {crm.r2:.3f} with the disturbance z, {crm.r2_without_z:.3f} without; "
-        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active"
-    ]
+    lines = []
     if report.proposals:
         lines.append(
             f"augmentation  {report.copies:,} augmented episodes, {report.acceptance:.1%} of their "
-            f"edits accepted; mean-move ratio {moves.mean_move_ratio:.2f}, effective rank "
-            f"{moves.effective_rank:.1f} of {moves.dimensions}"
+            "edits accepted"
         )
-    if actions is not None:
-        lines.append(
-            f"other actions {actions.copies:,} augmented steps of {actions.proposals:,} proposed; "
-            f"their reward differs by {actions.mean_change:+.3g} on average, "
-            f"{actions.earns_more:.0%} have a higher one than the logged action"
-        )
+    if (actions := report.actions) is not None:
+        lines.append(f"other actions {actions.copies:,} augmented steps of {actions.proposals:,}")
     lines.append(
         f"bound         δ + ε_r = {report.delta:.3g} + {report.epsilon_r:.3g}: {report.verdict}"
     )
@@ -427,19 +400,11 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
             f"{indent}It ranked best of {choice.tried} rules in the validation period.",
             f"{indent}Selected by the {choice.chosen_by}{choice.warning}",
         ]
-    doubts = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
-    if choice.halves_agree is not None:
-        would = ("both choose another", "one chooses this rule", "both choose this rule")
-        doubts.append(would[sum(choice.halves_agree)])
-    if estimate.optimism is not None:
-        off, error = estimate.optimism
-        doubts.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
     lines += [
         f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
         "simulated users, it has the best return",
         f"{indent}(or one level with it) that the log supports: {estimate.value:.4g} ± "
         f"{estimate.error:.2g} per session, estimated; logged sessions have {logged:.4g}.",
-        f"{indent}{'; '.join(doubts)}.",
         *(f"{indent}WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts),
     ]
     lines[-1] += choice.warning.replace("; WARNING", f"\n{indent}WARNING")

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from ucfrec import __version__, schema
+from ucfrec.acting.decision import best_items
 from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
-from ucfrec.choosing.choice import Problem
+from ucfrec.choosing.choice import Problem, RuleRecord
 from ucfrec.counterfactual.augmentation import (
     MODELS,
     AugmentationReport,
@@ -44,7 +45,6 @@ from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
     CANDIDATES,
     RUN,
-    RuleRecord,
     RunRecord,
     place_of,
     read_augmentation,
@@ -62,50 +62,40 @@ from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE,
 from ucfrec.user_model.model import UserModel
 
 SAMPLES: Final = "samples.json"
-PHASES: Final = 4
-"""Phases of a training that have progress of their own."""
 _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 
-@dataclass(frozen=True)
-class SharedStages:
-    """Stages that several runs have in common, each in a folder in `folder`; None for none."""
+def share_stage(
+    folder: Path | None,
+    inputs: Mapping[str, Any],
+    stage: str,
+    out: Path,
+    names: Sequence[str],
+    make: Callable[[], object],
+) -> None:
+    """Copy the files of a stage to the run folder `out`, or make them there and keep a copy.
 
-    folder: Path | None
+    Another process that needs the same stage waits until it is made.
 
-    def provide(
-        self,
-        inputs: Mapping[str, Any],
-        stage: str,
-        out: Path,
-        names: Sequence[str],
-        make: Callable[[], object],
-    ) -> None:
-        """Copy the files of a stage to the run folder `out`, or make them there and keep a copy.
-
-        Another process that needs the same stage waits until it is made.
-
-        Args:
-            inputs: all that the stage depends on: data, settings, seed. Another version of the
-                package makes its own.
-            names: files and folders of the stage in `out`, those that are made; the last one marks
-                the stage as finished, and is copied last. No file is ever there in part.
-        """
-        if self.folder is None:
-            make()
+    Args:
+        folder: of stages that several runs have in common, each in a folder of its own; None to
+            make them.
+        inputs: all that the stage depends on: data, settings, seed. Another version of the package
+            makes its own.
+        names: files and folders of the stage in `out`, those that are made; the last one marks the
+            stage as finished, and is copied last. No file is ever there in part.
+    """
+    if folder is None:
+        make()
+        return
+    stage_folder = folder / config_hash({**inputs, "stage": stage, "version": __version__})
+    with claim(stage_folder, wait=True):
+        if stage_folder.exists():
+            _copy(stage_folder, out, names)
             return
-        stage_folder = self.folder / config_hash({**inputs, "stage": stage, "version": __version__})
-        with claim(stage_folder, wait=True):
-            if stage_folder.exists():
-                _copy(stage_folder, out, names)
-                return
-            make()
-            with atomic_folder(stage_folder) as scratch:
-                _copy(out, scratch, names)
-
-
-OWN: Final = SharedStages(None)
-"""For a run that makes all its stages itself."""
+        make()
+        with atomic_folder(stage_folder) as scratch:
+            _copy(out, scratch, names)
 
 
 def _copy(source: Path, to: Path, names: Iterable[str]) -> None:
@@ -124,7 +114,8 @@ class _Inputs:
     record: RunRecord
     out: Path
     config: Config
-    shared: SharedStages
+    shared: Path | None
+    """As of `train_run`."""
     logged: EpisodeStore
     """The training episodes as they were logged."""
     held_out: EpisodeStore
@@ -145,7 +136,7 @@ def train_run(
     additions: Mapping[str, Any] | None = None,
     more_augmentation: AugmentedEpisodes | None = None,
     refit_of: Path | None = None,
-    shared: SharedStages = OWN,
+    shared: Path | None = None,
     callbacks: Callbacks = SILENT,
     initial: Path | None = None,
 ) -> RunRecord:
@@ -164,9 +155,9 @@ def train_run(
             counterfactual ones.
         refit_of: a finished run whose weights go on learning, from the validation and test
             episodes too, with its augmented episodes; see `ucfrec.runs.refit`.
-        shared: reward models and augmentation that runs on the same store have in common where
-            their settings of these stages and their seeds agree; by default a run makes its own.
-            The time of a stage is in the record of the run that made it.
+        shared: folder of reward models and augmentation that runs on the same store have in common
+            where their settings of these stages and their seeds agree; by default a run makes its
+            own. The time of a stage is in the record of the run that made it.
         initial: a run on an older state of the store, whose weights the training begins with, near
             whose rule a better one is looked for, and whose user model says which effects to fit.
 
@@ -183,9 +174,9 @@ def train_run(
         run = _prepare_inputs(store, out, config, additions or {}, refit_of, shared)
         if initial is not None:
             start_warm(run.policy, out, initial)
-        with phase("Counterfactual augmentation", 1, PHASES):
+        with phase("Counterfactual augmentation", 1, 4):
             augmented, augmentation = _augment(run, refit_of)
-        with phase("Training the policy", 2, PHASES):
+        with phase("Training the policy", 2, 4):
             if (more := more_augmentation) is not None:
                 augmented = more if augmented is None else augmented.join(more)
             updated, first = run.record.update, None
@@ -206,9 +197,9 @@ def train_run(
         record = run.record.copy_with(augmentation=augmentation, policy=fit)
         if run.logged.has_items:
             if config.rule.choose and not chosen:
-                with phase("Fitting the user model", 3, PHASES):
+                with phase("Fitting the user model", 3, 4):
                     users = _fit_user_model(run, initial)
-                with phase("Selecting the decision rule", 4, PHASES):
+                with phase("Selecting the decision rule", 4, 4):
                     rule = _choose_rule(run, users, initial)
                 record = record.copy_with(reward_model=users.reward_report, rule=rule)
             scorer = TrainedPolicy.load(out, in_training=True).scorer()
@@ -223,7 +214,7 @@ def _prepare_inputs(
     config: Config,
     additions: Mapping[str, Any],
     refit_of: Path | None,
-    shared: SharedStages,
+    shared: Path | None,
 ) -> _Inputs:
     """Check all inputs and begin the run, or reopen it."""
     train, validation = logged, held_out = training_views(store)
@@ -267,7 +258,7 @@ def _augment(
     crm, csg, augment = config.crm, config.csg, config.augment
     # A policy's own view of the episodes has augmentation of its own.
     has_own_view = run.train is not run.logged
-    shared = OWN if has_own_view or not run.record.return_to_go.per_session else run.shared
+    shared = None if has_own_view or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
         augmented, report = augment_episodes(
@@ -281,7 +272,7 @@ def _augment(
             inputs = _dependencies(run.train, run.validation, config.seed, device)
             inputs["settings"] = [asdict(table) for table in (crm, csg, augment)]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
-            shared.provide(inputs, augment_episodes.__module__, out, files, make)
+            share_stage(shared, inputs, augment_episodes.__module__, out, files, make)
         augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
         return augmented, read_augmentation(out / AUGMENTATION)
 
@@ -294,7 +285,7 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     inputs |= {"settings": [], "simulated": simulated}
     first = None if initial is None else initial / REWARD_MODEL
     fit = partial(UserModel.fit, train, validation, folder, run.config.seed, simulated, first)
-    run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
+    share_stage(run.shared, inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
 
@@ -312,10 +303,12 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
         run.config.seed,
         None if initial is None else rule_to_start_from(initial, trained),
     )
-    choice = choose_by_simulation(problem) if returns.per_session else choose_by_ranking(problem)
-    write_json(run.out / RULE, choice.rule.as_dict())
-    write_json(run.out / CANDIDATES, choice.list_candidates())
-    return RuleRecord.model_validate(choice.as_dict())
+    choose = choose_by_simulation if returns.per_session else choose_by_ranking
+    chosen, candidates = choose(problem)
+    write_json(run.out / RULE, chosen.rule.as_dict())
+    entries = [{**asdict(entry), "rule": entry.rule.as_dict()} for entry in candidates]
+    write_json(run.out / CANDIDATES, entries)
+    return chosen
 
 
 def _dependencies(
@@ -346,7 +339,7 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
     episodes = long_enough[places.astype(np.int64)]
     last = validation.lengths[episodes] - 1
     scores = logged_scores(scorer, validation, episodes, last)
-    best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
+    best = best_items(scores, min(_ITEMS, scores.shape[1]))
     sessions = []
     for place in range(len(episodes)):
         session = validation.select(episodes[[place]])
@@ -356,7 +349,7 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
                 "history": items[:-1][-_HISTORY:].tolist(),
                 "rewards": rewards[:-1][-_HISTORY:].tolist(),
                 "logged": int(items[-1]),
-                "recommended": best.indices[place].tolist(),
+                "recommended": best[place].tolist(),
             }
         )
     return {"rule": str(scorer.rule), "sessions": sessions}

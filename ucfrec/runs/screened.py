@@ -14,7 +14,7 @@ from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, Screening, read_record
-from ucfrec.runs.run import OWN, SharedStages, train_run
+from ucfrec.runs.run import share_stage, train_run
 from ucfrec.runs.start import training_views
 
 SCREENINGS: Final = ("drop", "copies")
@@ -37,7 +37,7 @@ def train_screened(
     config: Config,
     how: str | None,
     about: Mapping[str, Any] | None = None,
-    shared: SharedStages = OWN,
+    shared: Path | None = None,
     callbacks: Callbacks = SILENT,
     screen: Callable[[EpisodeStore, int], ScreeningReport] | None = None,
 ) -> RunRecord:
@@ -74,7 +74,8 @@ def train_screened(
         find = screen or screen_store
         with TemporaryDirectory() as scratch:  # made once for runs that share stages
             file = Path(scratch) / "screening.json"
-            shared.provide(
+            share_stage(
+                shared,
                 inputs,
                 find.__module__,
                 file.parent,

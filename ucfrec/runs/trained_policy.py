@@ -132,31 +132,28 @@ class TrainedPolicy:
 
     def _require_equal_sizes(self) -> None:
         """Check that the files of the run are of one catalogue and of one size of states."""
-        sizes, states, dropped = (
-            self.record.sizes,
-            self.item_states,
-            self.record.dropped_observations,
-        )
-        most = self.record.observation_size + len(dropped)
+        record, states = self.record, self.item_states
+        sizes, dropped = record.sizes, record.dropped_observations
+        most = record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
             raise InputError(
                 f"{self.folder / RUN} is damaged: of {most} columns of the observations it names "
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
-        state = self.record.observation_size + (0 if states is None else states.size)
-        sizes_found: dict[str, tuple[Any, Any]] = {}
-        # A store that was not made from logs has no tables of items and users.
+        state = record.observation_size + (0 if states is None else states.size)
+        checks: list[tuple[str, Any, Any]] = []
         if states is not None:
-            sizes_found[ITEM_STATES] = (sizes["items"], sizes["action"]), states.embeddings.shape
-            if self.item_ids is not None and (self.folder / ITEMS).exists():
-                sizes_found[ITEMS] = sizes["items"], len(self.item_ids)
+            shape = sizes["items"], sizes["action"]
+            checks.append((ITEM_STATES, shape, states.embeddings.shape))
+            # A store that was not made from logs has no tables of items and users.
+            if (self.folder / ITEMS).exists():
+                checks.append((ITEMS, sizes["items"], len(self.items)))
             if len(states.user_features) and (self.folder / USERS).exists():
-                sizes_found[USERS] = len(states.user_features), len(self.user_ids)
+                checks.append((USERS, len(states.user_features), len(self.user_ids)))
         if self.counts is not None:
             shapes = self.counts.shown.shape, self.counts.liked.shape
-            sizes_found[COUNTS] = ((sizes["items"],),) * 2, shapes
-        sizes_found[RUN] = sizes["state"], state
-        for name, (stated, actual) in sizes_found.items():
+            checks.append((COUNTS, ((sizes["items"],),) * 2, shapes))
+        for name, stated, actual in (*checks, (RUN, sizes["state"], state)):
             if stated != actual:
                 raise InputError(
                     f"{self.folder / name} does not fit the run: it has {actual}, the run "

@@ -3,9 +3,12 @@ the best settings as TOML, and a page of all trials."""
 
 import json
 import math
+import shlex
 import shutil
+import sqlite3
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -16,16 +19,16 @@ import torch
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.processes import block_ctrl_c, label_progress, pool_of_processes
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.tables import markdown_table
+from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.runs.config import Config
-from ucfrec.runs.run import SharedStages, train_run
+from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -44,6 +47,7 @@ _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
 _OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
+_REMEDY: Final = "restore it, or name another folder"
 _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
@@ -91,11 +95,6 @@ class Plan:
     prune: bool = True
     """Whether trials are ended early whose validation loss is above the median of the others'."""
 
-    @property
-    def stored(self) -> dict[str, str]:
-        """Address of the study's SQLite file, and the name of the study, for Optuna."""
-        return {"storage": f"sqlite:///{self.out / STUDY}", "study_name": "ucfrec"}
-
 
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
@@ -105,9 +104,9 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
 
     Raises:
         InputError: the folder holds another search, the numbers are out of range, the policies have
-            no such metric on this store, or no trial could be measured.
+            no such metric on this store, no trial could be measured, or the study's file is damaged
+            or cannot be written.
     """
-    optuna = _optuna()
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
     store = EpisodeStore.open(plan.store)
@@ -119,12 +118,11 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
                 f"{store.path}: {policy} has no estimated value there, because its decision rule "
                 f"is not selected in simulated sessions; {_OTHER_METRICS}"
             )
-    with lock_path(plan.out, "tuned"):
-        plan.out.mkdir(parents=True, exist_ok=True)
-        study: Study = optuna.create_study(**plan.stored, direction="maximize", load_if_exists=True)
-        _require_same(study, plan, store)
-        _enqueue_again(study)
-        left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
+    with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
+        with damage_explained(plan.out / STUDY, _REMEDY):
+            _require_same(study, plan, store)
+            _enqueue_again(study)
+            left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
         if len(shares) == 1:
             _run_trials(plan, shares[0], seed)
@@ -152,12 +150,40 @@ def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
     return plan.search.config(policy, values)
 
 
-def _optuna() -> Any:
+@contextmanager
+def _open_study(folder: Path, seed: int = 0) -> "Iterator[Study]":
+    """The study of a folder, new if it has none, while it is used; errors of its file become an
+    `InputError`.
+
+    Args:
+        seed: of what its trials draw.
+    """
     import optuna
+    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    return optuna
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / STUDY
+    # In a URL, some characters of the path would have a meaning.
+    connect = partial(sqlite3.connect, file, check_same_thread=False)
+    try:
+        with damage_explained(file, _REMEDY):
+            storage = optuna.storages.RDBStorage("sqlite:///file", {"creator": connect})
+            study = optuna.create_study(
+                storage=storage,
+                sampler=optuna.samplers.TPESampler(seed=seed),
+                study_name="ucfrec",
+                direction="maximize",
+                load_if_exists=True,
+            )
+        yield study
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        reason = str(error.__cause__ or error).partition("\n")[0]
+        raise InputError(
+            f"{file} cannot be read or written ({reason:.200}); free space on its disk, or "
+            f"{_REMEDY}"
+        ) from None
 
 
 def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
@@ -185,52 +211,54 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
 
 def _enqueue_again(study: "Study") -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
-    import optuna
+    from optuna.trial import TrialState
 
-    again = set(study.user_attrs.get("again", []))
     for trial in study.trials:
-        if trial.state.name == "RUNNING":
-            study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-        elif trial.state.name != "FAIL":
-            continue
-        if trial.number not in again and trial.params and "error" not in trial.user_attrs:
-            study.enqueue_trial(trial.params)
-            again.add(trial.number)
-    study.set_user_attr("again", sorted(again))
+        if trial.state == TrialState.RUNNING:
+            study.tell(trial.number, state=TrialState.FAIL)
+            if trial.params:
+                study.enqueue_trial(trial.params)
 
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
-    optuna = _optuna()
-    # A search that goes on must not draw the first points once more.
-    sampler = optuna.samplers.TPESampler(seed=seed)
-    study = optuna.load_study(**plan.stored, sampler=sampler)
-    objective = partial(_objective, plan, EpisodeStore.open(plan.store))
-    study.optimize(objective, n_trials=count, catch=(InputError,))
+    from optuna import TrialPruned
+    from optuna.trial import TrialState
+
+    store = EpisodeStore.open(plan.store)
+    # With the seed of the search, one that goes on would draw the first points once more.
+    with _open_study(plan.out, seed) as study:
+        for _ in range(count):
+            trial = study.ask()
+            try:
+                study.tell(trial, _measure_trial(plan, store, trial))
+            except TrialPruned:
+                study.tell(trial, state=TrialState.PRUNED)
+            except InputError as error:
+                trial.set_user_attr("error", str(error))
+                study.tell(trial, state=TrialState.FAIL)
 
 
-def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
-    import optuna
+def _measure_trial(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
+    """The metric of a trial, whose run is deleted unless it is the best."""
+    from optuna import TrialPruned
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
         if plan.prune and "validation_loss" in logged:
             trial.report(logged["validation_loss"], step)
             if _is_hopeless(trial.study, trial.number, policy):
-                raise optuna.TrialPruned
+                raise TrialPruned
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
-    run = plan.out / TRIAL
+    config = plan.search.config(policy, values)
+    run = _name_run(plan, config)
+    shared, callbacks = plan.out / STAGES, Callbacks(on_validation=stop_hopeless)
     try:
-        config = plan.search.config(policy, values)
-        run = _name_run(plan, config)
-        shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
         with label_progress(f"trial {trial.number}"):
             train_run(store, run, config, shared=shared, callbacks=callbacks)
             value = measure_run(TrainedPolicy.load(run), store, plan.metric, plan.k)
-    except (InputError, optuna.TrialPruned) as error:
-        if isinstance(error, InputError):
-            trial.set_user_attr("error", str(error))
+    except (InputError, TrialPruned):
         shutil.rmtree(run, ignore_errors=True)
         raise
     if value <= max(_list_values(trial.study), default=-math.inf):
@@ -294,7 +322,7 @@ def importances(study: "Study") -> dict[str, float]:
 
 def _write_report(study: "Study", plan: Plan) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
-    config = config_of(plan, study.best_trial)
+    config, file = config_of(plan, study.best_trial), plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
     if "train.steps" in names:
         names.add("train.warmup_steps")
@@ -303,45 +331,44 @@ def _write_report(study: "Study", plan: Plan) -> None:
         table, _, field = name.partition(".")
         value = chosen[table][field] if name in names else plan.search.fixed[name]
         tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
-    file = plan.out / BEST_TOML
-    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
-    count = len(list_finished(study))
-    head = f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"
-    with atomic_file(file) as scratch:
-        scratch.write_text(head + "".join(tables.values()), encoding="utf-8")
-    with atomic_file(plan.out / PAGE) as scratch:
-        scratch.write_text(_page(study, plan, command), encoding="utf-8")
-
-
-def _page(study: "Study", plan: Plan, command: str) -> str:
-    trials = sorted(
-        (t for t in study.trials if t.state.is_finished()),
-        key=lambda t: (t.value is None or t.state.name != "COMPLETE", -(t.value or 0.0)),
+    options = ("--policy", config.policy_name, "--config", str(file), "--out", "RUN")
+    command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
+    head = (
+        f"{plan.metric} {study.best_value:.6g} in trial {study.best_trial.number} of "
+        f"{len(list_finished(study))}"
     )
-    names = list(dict.fromkeys(name for trial in trials for name in trial.params))
-    body = []
-    for trial in trials:
-        outcomes = {"COMPLETE": f"{trial.value or 0:.6g}", "PRUNED": "ended early"}
-        error = str(trial.user_attrs.get("error", "interrupted"))[:80]
-        values = (trial.params.get(name, "") for name in names)
-        cells = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
-        body.append((trial.number, outcomes.get(trial.state.name, error), *cells))
-    shares = importances(study)
+    with atomic_file(file) as scratch:
+        text = f"# {head}\n# {command}\n{''.join(tables.values())}"
+        scratch.write_text(text, encoding="utf-8")
+    shares = [(name, f"{share:.2f}") for name, share in importances(study).items()]
     parts = [
         f"# Search on {plan.store}",
-        f"Metric: {plan.metric}, the {METRICS[plan.metric]}. The best trial, "
-        f"{study.best_trial.number}, has {study.best_value:.6g}; its run is `{BEST}`. It was "
+        f"{head}; its run is `{BEST}`. The metric is the {METRICS[plan.metric]}. The trial was "
         "selected on validation rows: estimate it on the test split or on later logs.",
         f"To train it again: `{command}`",
         "## Importance",
-        "Share of the variance of the metric between trials that a setting explains (fANOVA).",
-        markdown_table(("setting", "importance"), [(n, f"{v:.2f}") for n, v in shares.items()])
-        if shares
-        else "Too few trials to compare.",
+        "Share of the variance of the metric between trials that a setting explains (fANOVA); none "
+        "with too few trials.",
+        markdown_table(("setting", "importance"), shares),
         "## Trials",
-        markdown_table(("trial", plan.metric, *names), body),
+        _tabulate_trials(study, plan.metric),
     ]
-    return "\n\n".join(parts) + "\n"
+    with atomic_file(plan.out / PAGE) as scratch:
+        scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _tabulate_trials(study: "Study", metric: str) -> str:
+    """The trials, best first; those without a value last."""
+    trials = [trial for trial in study.trials if trial.state.is_finished()]
+    trials.sort(key=lambda t: (t.state.name != "COMPLETE", -(t.value or 0.0)))
+    names = dict.fromkeys(name for trial in trials for name in trial.params)
+    body = []
+    for trial in trials:
+        error = trial.user_attrs.get("error", "ended early or interrupted")
+        outcome = f"{trial.value:.6g}" if trial.state.name == "COMPLETE" else error
+        settings = (format_value(trial.params.get(name)) for name in names)
+        body.append((trial.number, outcome, *settings))
+    return markdown_table(("trial", metric, *names), body)
 
 
 def format_toml(value: Any) -> str:

@@ -17,7 +17,7 @@ from ucfrec.runs.record import Difference, UpdateResult, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_report import (
     RewardRows,
-    calibration,
+    calibration_error,
     draw_steps,
     fit_line,
     score_rows,
@@ -55,13 +55,8 @@ def compare_runs(
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, seen)
     old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
-    if liked.any():
-        gained = (new_gain - old_gain) * liked
-        differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
-    else:
-        differences = [
-            Difference(measure=RANKING, value=0, low=0, high=0, doubt="no step was liked")
-        ]
+    gained = (new_gain - old_gain) * liked
+    differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
     if schema.PROPENSITY in rows.record.columns:
         propensity = rows.column(schema.PROPENSITY).astype(np.float64)
         if (weighed := propensity > 0).any():
@@ -124,7 +119,7 @@ def _compare(
     doubt: str = "",
 ) -> Difference:
     """The ratio of sums over steps (N,), with its interval over users."""
-    low = high = value = float(above.sum() / below.sum())
+    low = high = value = float(above.sum() / (below.sum() or 1))
     users = len(np.unique(user[below > 0]))
     if users < FEWEST_USERS:
         doubt = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
@@ -225,14 +220,14 @@ def measure_drift(
     if model is None or not in_catalogue.any():
         return measures
     reward_rows = RewardRows.at(sample, episodes[in_catalogue], steps[in_catalogue], model.reach)
-    scores = score_rows(model, reward_rows)[0]
+    scores = score_rows(model, reward_rows)
     predicted = model.expect(scores).double().numpy()
     observed = reward_rows.rewards.double().numpy()
     slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))
     return measures | {
         "predicted": float(predicted.mean()),
         "observed": float(observed.mean()),
-        "calibration_error": calibration(predicted, observed).error,
+        "calibration_error": calibration_error(predicted, observed),
         "slope": slope,
     }
 

@@ -1,6 +1,6 @@
 """The user model, reward of every item, session ends and fatigue, and sessions simulated in it."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -55,8 +55,6 @@ class UserModel:
     main_tags: MainTags
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new."""
-    report: dict[str, Any] = field(default_factory=dict)
-    """What simulated sessions are drawn from, as a JSON object."""
 
     @classmethod
     def fit(
@@ -117,7 +115,6 @@ class UserModel:
                 fatigue=of_fatigue and Fatigue(**of_fatigue),
                 main_tags=tags,
                 calibration_report=of_calibration and UserCalibration(**of_calibration),
-                report={**metadata, "users": users and asdict(users.report)},
             )
 
     @property
@@ -144,12 +141,7 @@ class LoggedRewards:
     expected reward, as what follows, such as the session's end, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        batches = store.column_batches(schema.REWARD)
-        parts = [np.unique(rewards, return_counts=True) for (rewards,) in batches]
-        distinct = np.concatenate([values for values, _ in parts])
-        numbers = np.concatenate([counts for _, counts in parts])
-        rewards, place = np.unique(distinct, return_inverse=True)
-        counts = np.bincount(place, numbers)
+        rewards, counts = np.unique(store.column(schema.REWARD), return_counts=True)
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]
         if len(values) > _GROUPS:
             middle = (counts.cumsum() - counts / 2) / counts.sum()

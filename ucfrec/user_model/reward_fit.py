@@ -8,7 +8,6 @@ shows make what they showed look better; known users are calibrated on weighted 
 
 from dataclasses import dataclass
 from pathlib import Path
-from time import process_time
 from typing import Any, Final
 
 import numpy as np
@@ -37,7 +36,6 @@ from ucfrec.user_model.reward_report import (
     Line,
     RewardRows,
     fit_line,
-    measure_quality,
     weigh_by_propensity,
 )
 
@@ -58,9 +56,6 @@ class TrainingUsersReport:
     """Slope and intercept of the model's scores on training rows that were held back."""
     effects: tuple[EffectTried, ...]
     """The effects that were tried, evaluated on these rows."""
-    steps: int
-    effective_steps: float
-    """As many steps of equal weight count as much; `steps` without propensities."""
     weighted: bool
     """Whether the effects are fitted to rows weighted by propensities."""
 
@@ -111,9 +106,8 @@ def fit_item_reward_model(
     if (metadata := _read_fit(file, model)) is not None:
         with damage_explained(file, REMEDY):
             return model, ItemRewardReport(**metadata)
-    start, states = process_time(), train.item_states
     rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
-    set_statistics(model, rows, held_out, states)
+    set_statistics(model, rows, held_out, train.item_states)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
@@ -137,13 +131,11 @@ def fit_item_reward_model(
         search.fit_to(design)
     model.set_effects(search.effects, search.design.sum_content)
     report = ItemRewardReport(
-        **measure_quality(model, rows, held_out, states),
         effects=search.report(),
         new_users=search.new_users,
         base_loss=search.base_loss,
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),
-        seconds=process_time() - start,
     )
     save_fit(file, model, search.effects, report)
     return model, report
@@ -207,8 +199,7 @@ def fit_training_users(
     scores = held_out.predictor(search.effects)
     line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
     search.fit_to(design)
-    effects, is_weighted = search.report(), weights is not None
-    report = TrainingUsersReport(line, effects, len(rows), design.count, is_weighted)
+    report = TrainingUsersReport(line, search.report(), weights is not None)
     model.set_effects(search.effects, search.design.sum_content)
     save_fit(file, model, search.effects, report)
     return TrainingUsers(model, report)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pydantic
@@ -12,16 +12,11 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.files.record import Undefinable
-from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
 _BINS: Final = 10
-_PRIOR: Final = 10.0
-"""Impressions at the mean rate that are added to those of an item."""
 _CHUNK: Final = 16_384
 _READ_AT_ONCE: Final = 65_536
 _LARGEST_WEIGHT: Final = 10.0
@@ -149,43 +144,16 @@ class EffectTried:
     """Whether it is part of the model: the gain is above its standard error."""
 
 
-@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
-class Calibration:
-    """Held-out rows in 10 bins of equal size by predicted reward, in ascending order."""
-
-    predicted: tuple[float, ...]
-    """Mean predicted reward of each bin, in reward units."""
-    observed: tuple[float, ...]
-    count: tuple[int, ...]
-    error: float
-    """Expected calibration error: mean over rows of |predicted − observed| of their bins."""
-
-
-@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+@pydantic.dataclasses.dataclass(frozen=True)
 class ItemRewardReport:
-    """Quality of the reward model of items, on held-out rows."""
+    """Losses of the reward model of items on held-out rows: nats if rewards have two values, else
+    squared errors of standardised rewards."""
 
-    train_rows: int
-    validation_rows: int
-    binary: bool
-    """Whether rewards have two values, and losses are nats; else squared errors, standardised."""
     effects: tuple[EffectTried, ...]
     """The effects in the order in which they were tried."""
     base_loss: float
     item_loss: float
     loss: float
-    r2: Undefinable
-    calibration: Calibration
-    gauc: Undefinable
-    """Probability that a liked step scores higher than another of the same user, by impressions,
-    without what all items share at a step."""
-    gauc_error: Undefinable
-    item_rate_gauc: Undefinable
-    """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""
-    gauc_gain: Undefinable
-    gauc_gain_error: Undefinable
-    seconds: float
-    """Processor time of the fit."""
     new_users: bool = False
     """Whether held-out rows are of users without training rows, and no effects of users kept."""
 
@@ -195,26 +163,22 @@ class ItemRewardReport:
         return {entry.effect: entry.spread for entry in self.effects if entry.kept}
 
 
-def score_rows(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]:
-    """Linear predictors (M,) of the items shown in `rows`, and what all items share in them."""
-    scores, levels = [torch.zeros(0)], [torch.zeros(0)]
+def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
+    """Linear predictors (M,) of the items shown in `rows`."""
+    scores = [torch.zeros(0)]
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         states, users, history = rows.states[part], rows.users[part], rows.history.at(part)
         scores.append(model.score(states, history, users, rows.items[part]))
-        levels.append(model.level(states, users, model.tastes_after(history)))
-    return torch.cat(scores), torch.cat(levels)
+    return torch.cat(scores)
 
 
-def calibration(predicted: Float64Array, observed: Float64Array) -> Calibration:
-    """The calibration of predicted rewards (M,) against observed ones (M,)."""
+def calibration_error(predicted: Float64Array, observed: Float64Array) -> float:
+    """Mean over rows (M,), in 10 bins of equal size by predicted reward, of the difference between
+    the mean predicted and the mean observed reward of their bin."""
     order = np.argsort(predicted, kind="stable")
-    bins = [part for part in np.array_split(order, _BINS) if len(part)]
-    expected = tuple(float(predicted[part].mean()) for part in bins)
-    seen = tuple(float(observed[part].mean()) for part in bins)
-    count = tuple(map(len, bins))
-    error = np.average(np.abs(np.subtract(expected, seen)), weights=count)
-    return Calibration(expected, seen, count, float(error))
+    off = [part.sum() for part in np.array_split((predicted - observed)[order], _BINS)]
+    return float(np.abs(off).sum()) / len(order)
 
 
 def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
@@ -231,38 +195,6 @@ def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | Non
         return 1.0, 0.0
     model = LinearRegression().fit(inputs, outcomes, counts)
     return float(model.coef_[0]), float(model.intercept_)
-
-
-def measure_quality(
-    model: ItemRewardModel, rows: RewardRows, held_out: RewardRows, states: ItemStates
-) -> dict[str, Any]:
-    """What `ItemRewardReport` says of the predictions of held-out rows."""
-    scores, levels = score_rows(model, held_out)
-    predicted = model.expect(scores).double().numpy()
-    observed = held_out.rewards.double().numpy()
-    variance = float(observed.var()) or float("nan")
-    least = least_liked(states.reward_low, states.reward_high)
-    impressions = torch.bincount(rows.items, minlength=len(model.item)).double()
-    likes = torch.bincount(rows.items, (rows.rewards >= least).double(), len(model.item))
-    rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
-    _, owner = np.unique(held_out.users.numpy(), return_inverse=True)
-    liked, n_users = (held_out.rewards >= least).numpy(), int(owner.max(initial=-1)) + 1
-    above, below = group_auc((scores - levels).double().numpy(), liked, owner, n_users)
-    of_rates, _ = group_auc(rates[held_out.items].numpy(), liked, owner, n_users)
-    value, error = ratio_with_error(above, below)
-    gain, gain_error = ratio_with_error(above - of_rates, below)
-    return {
-        "train_rows": len(rows),
-        "validation_rows": len(held_out),
-        "binary": bool(model.binary),
-        "r2": 1 - float(np.square(predicted - observed).mean()) / variance,
-        "calibration": calibration(predicted, observed),
-        "gauc": value,
-        "gauc_error": error,
-        "item_rate_gauc": value - gain,
-        "gauc_gain": gain,
-        "gauc_gain_error": gain_error,
-    }
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -288,7 +220,7 @@ class UserCalibration:
         half = number_users(view)[episodes] % 2
         weights = weigh_by_propensity(view, episodes, steps, len(model.item))
         counts = torch.ones(len(rows)) if weights is None else weights
-        scores, target = score_rows(model, rows)[0], model.target(rows.rewards)
+        scores, target = score_rows(model, rows), model.target(rows.rewards)
 
         def fit_part(chosen: BoolArray) -> Line:
             part = torch.from_numpy(chosen)

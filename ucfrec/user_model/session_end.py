@@ -20,7 +20,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
-from ucfrec.user_model.reward_report import SAVED, draw_numbers, mean_gain
+from ucfrec.user_model.reward_report import draw_numbers, mean_gain
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
@@ -103,16 +103,12 @@ def whole_sessions(
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 
-@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+@pydantic.dataclasses.dataclass(frozen=True)
 class SessionEndReport:
     """How well session ends are predicted."""
 
-    rows: int
-    validation_rows: int
     loss: Mapping[str, float]
     """Held-out log loss (nats) of each kind of model: `constant`, `logistic` and `boosted`."""
-    gain: Mapping[str, tuple[float, float]]
-    """By how much it is below that of the best simpler kind, and the standard error."""
     kept: str
     """The kind that is kept: each must lower the loss of simpler ones by more than the error."""
     last_sessions: bool = True
@@ -184,14 +180,13 @@ class SessionEnd:
             kinds["boosted"] = fit_trees(inputs.numpy(), ended, seed)
         models = {kind: cls(likeness, tensors) for kind, tensors in kinds.items()}
         losses = {kind: model._losses(held_out) for kind, model in models.items()}
-        gains, best = dict[str, tuple[float, float]](), "constant"
+        best = "constant"
         for kind in kinds:
-            gain, error = gains[kind] = mean_gain(losses[best], losses[kind])
+            gain, error = mean_gain(losses[best], losses[kind])
             if gain > error:
                 best = kind
         means = {kind: float(entry.mean()) if len(entry) else 0.0 for kind, entry in losses.items()}
-        report = SessionEndReport(len(ended), len(held_out.ended), means, gains, best)
-        return models[best], report
+        return models[best], SessionEndReport(means, best)
 
     def _losses(self, rows: LoggedEnds) -> Tensor:
         odds = self._log_odds(rows.inputs)

@@ -9,10 +9,10 @@ from ucfrec.benchmark.cells import Cell, Measurement, open_store, training_confi
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_control.benchmark.methods import PAPER_UCF
 from ucfrec_control.benchmark.robustness import verdicts
 from ucfrec_control.data.distractor import CLEAN
-from ucfrec_control.training.evaluate import evaluate_run, held_out_losses
+from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,
@@ -23,6 +23,10 @@ from ucfrec_control.training.rl_baselines import (
 )
 from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
+PRESET_STEPS: Final = 100_000
+"""Updates of the presets, which a budget may shorten."""
+UPDATES: Final = "updates"
+"""Detail of rows with the paper's settings: in words, how much of its training they had."""
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
 DISTRACTOR: Final = "distractor"
@@ -72,11 +76,19 @@ def train(cell: Cell) -> RunRecord | RLRecord:
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train, and evaluate every kept checkpoint; returns one row for each, and for each target."""
     train(cell)
-    rows = [row.of(row_key) for row in evaluate(cell)]
+    rows = [row.of(row_key).extended(describe_updates(cell)) for row in evaluate(cell)]
     if not cell.evaluation.all_targets:
         return rows
     # Rows of one seed that differ in their target are measurements of their own.
     return [replace(r, conditions={**r.conditions, TARGET: r.target_return}) for r in rows]
+
+
+def describe_updates(cell: Cell) -> dict[str, str]:
+    """What a row with the paper's settings says of the length of its training."""
+    if not cell.method.startswith(PAPER_UCF):
+        return {}
+    share = 100 * cell.config.train.steps / PRESET_STEPS
+    return {UPDATES: f"the paper's settings, {share:.2g}% of its updates"}
 
 
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
@@ -87,8 +99,7 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     # All evaluations have the same initial states, with and without distractor.
     values = (0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0)
     evaluations = [evaluate(cell, checkpoints=("last",), distractor=v)[0] for v in values]
-    losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
-    more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **losses}
+    more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **describe_updates(cell)}
     if record.screening is not None:
         more[SCREENING] = verdicts(record.screening.dimensions, store)
     return [evaluations[0].of(row_key).extended(more)]

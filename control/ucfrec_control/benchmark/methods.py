@@ -1,6 +1,6 @@
 """Rows of the control tables: policies and their settings, by the name of the row."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from ucfrec.benchmark.cells import Method, make_augmented_ucf
@@ -10,11 +10,32 @@ SCORES, ROBUSTNESS = "control", "robustness"
 Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"
 _ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
-PAPER: Methods = {
-    "ucf-paper": Method("ucf-paper"),
-    "ucf-paper-algorithm-5": Method("ucf-paper", _ALGORITHM_5),
+_NO_GATE = "augment.epsilon_r=1e9"
+"""Disables the gate on the change of the reward; the limit on a move's length stays."""
+LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+PAPER_UCF = "ucf-paper"
+"""What the names of methods with the paper's settings begin with; a budget shortens their
+training, and changes nothing else (`settings_of`)."""
+
+
+def _paper_rows(rows: Mapping[str, tuple[str, ...]]) -> Methods:
+    return {f"{PAPER_UCF}-{name}": Method(PAPER_UCF, settings) for name, settings in rows.items()}
+
+
+PAPER: Methods = {PAPER_UCF: Method(PAPER_UCF), **_paper_rows({"algorithm-5": _ALGORITHM_5})}
+"""UCF as read in the paper, with Appendix H's copies and with Algorithm 5's."""
+PAPER_ABLATIONS: Methods = {
+    **_paper_rows({"wo-count": ("augment.copies=0",)}),
+    f"{PAPER_UCF}-wo-arch": Method(
+        "dt",
+        (
+            *("augment.copies=1", "csg.kind=faithful", "csg.max_transitions=1000000000"),
+            *("crm.mean_first=false", "crm.learning_rate=3e-4", "crm.epochs=40"),
+            *("crm.max_transitions=1000000000", "train.average=0.0"),
+        ),
+    ),
 }
-"""UCF as the paper has it, with Appendix H's copies and with Algorithm 5's."""
+"""Table 3's ablations of it: the second is DT on its augmented data."""
 METHODS: Methods = {
     "bc": Method("bc"),
     "bc-10": Method("bc", ("policy.best_share=0.1",)),
@@ -30,10 +51,11 @@ METHODS: Methods = {
     "ucf": make_augmented_ucf(),
     "ucf-w-time": make_augmented_ucf("policy.max_timestep=1000"),
     **PAPER,
+    **PAPER_ABLATIONS,
     "ucf-wo-count": Method("ucf"),
     "ucf-wo-arch": Method("dt", (_NO_TIME, "augment.copies=1")),
 }
-"""Methods by the name of the table's row; the last two are Table 3's ablations.
+"""Methods by the name of the table's row; the last two are Table 3's ablations of `ucf`.
 
 UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
 and `…-wo-time` are the reverse. `ucf-wo-arch` has none, as UCF.
@@ -46,9 +68,6 @@ WITHOUT_TIME = (
 WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
 """Methods with embeddings of time steps of which there is one without."""
 
-_FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
-_NO_GATE = "augment.epsilon_r=1e9"
-"""Disables the gate on the change of the reward; the limit on a move's length stays."""
 METHODS_WO_TIME = {"dt": "dt-wo-time", "dc": "dc-wo-time", "lsdt": "lsdt-wo-time", "ucf": "ucf"}
 """The method without embeddings of time steps, by policy."""
 _PURSUITS = {
@@ -87,40 +106,26 @@ _TABLES: dict[str, Methods] = {
     },
     # All but the paper's without embeddings of time steps, as UCF is.
     PURSUING: _rows((*_BASELINES, *_UCF), _PURSUITS),
-    # Figure 2.
+    # Figure 2; the paper's settings have λ 0.1.
     LAMBDA: {
-        f"ucf-lambda-{weight:g}": make_augmented_ucf(f"policy.lambda_mask={weight}")
-        for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+        **{
+            f"ucf-lambda-{weight:g}": make_augmented_ucf(f"policy.lambda_mask={weight}")
+            for weight in LAMBDAS
+        },
+        **_paper_rows({f"lambda-{w:g}": (f"policy.lambda_mask={w}",) for w in LAMBDAS if w != 0.1}),
     },
-    # Table 9, with each generator.
+    # Table 9, with the tangent generator and with the paper's.
     "gate": {
         "ucf": make_augmented_ucf(),
         "ucf-wo-gate": make_augmented_ucf(_NO_GATE),
-        "faithful": make_augmented_ucf(_FAITHFUL),
-        "faithful-wo-gate": make_augmented_ucf(_FAITHFUL, _NO_GATE),
+        **_paper_rows({"wo-gate": (_NO_GATE,)}),
     },
     # Table 10: λ_band exists for the paper's network only; for tangent moves the band is widened.
     "band": {
         "ucf": make_augmented_ucf(),
         "ucf-wide": make_augmented_ucf("csg.band=[0.2, 2.0]"),
         "ucf-wo-lower": make_augmented_ucf("csg.band=[0.0, 0.5]"),
-        "faithful": make_augmented_ucf(_FAITHFUL),
-        "faithful-wo-band": make_augmented_ucf(_FAITHFUL, "csg.lambda_band=0.0"),
-        "faithful-wo-lower": make_augmented_ucf(_FAITHFUL, "csg.band=[0.0, 0.5]"),
-    },
-    # Does augmentation help? Each generator and variant of the copies, with and without gate.
-    "augmentation": {
-        "ucf-wo-count": Method("ucf"),
-        **{
-            f"{name}{variant}{gate}": make_augmented_ucf(*kind, *copies, *gate_settings)
-            for name, kind, gates in (
-                ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
-                ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
-                ("noise", (_NOISE,), (("-wo-gate", (_NO_GATE,)),)),
-            )
-            for variant, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
-            for gate, gate_settings in gates
-        },
+        **_paper_rows({"wo-band": ("csg.lambda_band=0.0",), "wo-lower": ("csg.band=[0.0, 0.5]",)}),
     },
 }
 LONGER = {
@@ -139,7 +144,7 @@ SCREENED = {
 ROBUST: Methods = {
     **{
         name: METHODS[name]
-        for name in (*METHODS_WO_TIME.values(), "ucf-paper", "ucf-wo-count", "ucf-wo-arch")
+        for name in (*METHODS_WO_TIME.values(), PAPER_UCF, "ucf-wo-count", "ucf-wo-arch")
     },
     **SCREENED,
 }

@@ -11,10 +11,11 @@ from typing import Final
 from ucfrec.benchmark.cells import Budget, Cell, Method, Plan, Presets, Task
 from ucfrec.benchmark.grid import select_names
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
+from ucfrec_control.benchmark.measure import DISTRACTOR, PRESET_STEPS, RATE
 from ucfrec_control.benchmark.methods import (
     METHODS,
     METHODS_WO_TIME,
+    PAPER_UCF,
     ROBUST,
     ROBUSTNESS,
     SCORES,
@@ -24,6 +25,8 @@ from ucfrec_control.benchmark.methods import (
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
+
+PRESET_WARMUP: Final = 10_000
 
 
 def score_cells(
@@ -97,7 +100,8 @@ def _find_tuned() -> Methods:
     with embeddings of time, and one without."""
     methods: dict[tuple[str, tuple[str, ...]], str] = {}
     for name, method in METHODS.items():
-        methods.setdefault((method.policy, _time_settings(method.settings)), name)
+        if not name.startswith(PAPER_UCF):
+            methods.setdefault((method.policy, _time_settings(method.settings)), name)
     return {name: METHODS[name] for name in methods.values()}
 
 
@@ -120,7 +124,18 @@ def chosen_rates(budget: str) -> Mapping[str, float]:
 
 
 def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
-    """Settings of a training over its presets: the budget's, the chosen rate, the method's own."""
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own.
+
+    Of the paper's settings a budget changes the number of updates alone, and in proportion that of
+    the warm-up; what it does not learn from, such as how often it is validated, is the budget's.
+    """
+    if name.startswith(PAPER_UCF):
+        given = dict(setting.split("=", 1) for setting in budget.settings)
+        steps = int(given.get("train.steps", PRESET_STEPS))
+        warmup, every = PRESET_WARMUP * steps // PRESET_STEPS, "train.validate_every"
+        shorter = (f"train.steps={steps}", f"train.warmup_steps={warmup}")
+        rarely = (f"{every}={given[every]}",) if every in given else ()
+        return (*shorter, *rarely, *method.settings, *budget.of_methods.get(name, ()))
     policy_settings = budget.of_policies.get(method.policy, ())
     rate = _rate_of(budget, method)
     if method.policy in ALGORITHMS:

@@ -5,7 +5,7 @@ evaluated with the distractor fixed to 0. Two trainings also differ randomly. Ev
 policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ucfrec.counterfactual.screening import DimensionReport
@@ -17,7 +17,6 @@ from ucfrec_control.data.distractor import CLEAN
 
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
-SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
 SHOWN_SCREENING = (
     *("task", "distractor", "flagged", "effect", "reward_effect"),
     *("true_flagged", "weakest_true"),
@@ -68,16 +67,6 @@ def largest_drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
         ]
         lines.append(dict(zip(SHOWN_LARGEST, (method, *largest), strict=True)))
     return lines
-
-
-def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
-    """Lines of rows with a distractor, and `rise`: by how many percent the held-out action loss
-    rises when the distractor is fixed to 0."""
-    return [
-        {**row.as_line(), "rise": 100 * (row.metrics["loss_at_zero"] / row.metrics["loss"] - 1)}
-        for row in rows
-        if row.conditions["distractor"] != CLEAN and row.metrics.get("loss")
-    ]
 
 
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""`ucfrec-control evaluate`: normalised scores of trained policies."""
+"""`ucfrec-control evaluate`: returns of trained policies, and scores where they are known."""
 
 import sys
 import warnings
@@ -35,10 +35,12 @@ class Evaluate(Table):
     target: Annotated[Sequence[float | None], target_given] = ()
     """Target return, or max for the largest that the policy expects in each state; repeatable
     (default: the preset's)"""
-    checkpoint: Literal["both", "best", "last"] = "both"
+    checkpoint: Literal["both", "best", "last", "return"] = "both"
     """Weights to evaluate."""
     distractor: float = 0.0
     """Value that distractors are fixed to."""
+    reference: Annotated[tuple[float, float] | None, "LOW HIGH"] = None
+    """Returns that score 0 and 100 (default: D4RL's for its tasks; without them, returns alone)"""
     video: Annotated[Path | None, "MP4"] = None
     """Record an episode: FILE.mp4, or folder for frames."""
     json: Path | None = None
@@ -58,6 +60,7 @@ class Evaluate(Table):
         for run in self.runs:
             checkpoints = CHECKPOINTS if self.checkpoint == "both" else (self.checkpoint,)
             how: dict[str, Any] = {"episodes": self.episodes, "checkpoints": checkpoints}
+            how["reference"] = self.reference
             rows += evaluate_run(run, targets=self.target, **how, **self._options())
         print(format_rows([_shown(row) for row in rows], SHOWN))
         mismatches: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
@@ -72,7 +75,7 @@ class Evaluate(Table):
     def _record(self, video: Path) -> None:
         if len(self.runs) != 1:
             raise InputError(f"--video records one run; {len(self.runs)} were given")
-        checkpoint = "best" if self.checkpoint == "best" else "last"
+        checkpoint = "last" if self.checkpoint == "both" else self.checkpoint
         how: dict[str, Any] = {"checkpoint": checkpoint, "target": next(iter(self.target), None)}
         episode_return = record_episode(self.runs[0], video, **how, **self._options())
         print(f"{video}: an episode of return {episode_return:.1f}\n")
@@ -91,8 +94,9 @@ def _explain_targets(runs: Sequence[Path]) -> None:
 
 
 def _shown(row: ResultRow) -> dict[str, Any]:
-    """A row with its score, interval and target as text."""
+    """A row with its score or return, interval and target as text."""
     low, high = row.interval or (row.value, row.value)
+    value = {row.metric: f"{row.value:.1f} [{low:.1f}, {high:.1f}]"}
     target = "none" if row.rule == NO_TARGET else MAX_RETURN
     if row.target_return is not None:
         target = f"{row.target_return:g}"
@@ -101,7 +105,7 @@ def _shown(row: ResultRow) -> dict[str, Any]:
         **row.as_line(),
         "dataset": row.task,
         "seed": row.training_seed,
-        "score": f"{row.value:.1f} [{low:.1f}, {high:.1f}]",
         "target_return": target,
         "return": f"{row.metrics['return']:.1f}",
+        **value,
     }

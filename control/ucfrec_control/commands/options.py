@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.benchmark.grid import run_grid
 from ucfrec.commands.benchmark import GridOptions
 from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, one_line
-from ucfrec.results.rows import ResultRow
+from ucfrec.results.rows import ResultRow, benchmarking
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import set_contexts
@@ -86,7 +87,7 @@ class ControlGridOptions(GridOptions):
     """Steps of history of a method; repeatable (default: the budget's)"""
     budget: Literal["small", "medium", "full"] = "small"
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
-    times the windows; about 20 core hours for the main table), full (the steps, seeds and episodes
+    times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
     of the papers)"""
     seeds: Annotated[int | None, "N"] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""
@@ -105,6 +106,10 @@ class ControlGridOptions(GridOptions):
                 "that are there"
             )
         return self.data
+
+    def measure(self, cells: Iterable[Cell], how: Measurement, describe: str) -> list[ResultRow]:
+        """The rows of cells, which are measured where they have none."""
+        return run_grid(cells, how, self.rows_file, self.workers, describe, self.again)
 
     def narrow_budget(
         self, budget: Budget, files: Sequence[str] = (), evaluation_seed: int | None = None
@@ -137,19 +142,20 @@ class SuiteOptions(ControlGridOptions):
         list_cells: Callable[[Path, Path, Budget, Sequence[str]], Iterable[Cell]],
         describe: str = "",
     ) -> list[ResultRow]:
-        """The rows that a command shows, as `GridOptions.make_rows`.
+        """The rows that a command shows: with --show-only those of the file, else those of cells.
 
         Args:
             table: the one that is measured and shown; "" for all of the suite.
             list_cells: lists the cells of data, folder, budget and methods.
+            describe: name of the benchmark in progress output; "" for `suite`.
         """
         budget = budget_of(table or suite, self.budget)
         budget = self.narrow_budget(budget, self.file, self.evaluation_seed)
-
-        def cells() -> Iterable[Cell]:
-            return list_cells(self.require_data(), self.out, budget, self.method)
-
-        return self.make_rows(suite, [table] if table else [], cells, how, describe)
+        if self.show_only:
+            return self.read_rows(suite, [table] if table else [])
+        with benchmarking(self.rows_file):
+            cells = list_cells(self.require_data(), self.out, budget, self.method)
+            return self.measure(cells, how, describe or suite)
 
 
 def describe_source(trajectories: Trajectories) -> str:

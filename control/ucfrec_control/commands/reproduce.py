@@ -8,10 +8,10 @@ from typing import Annotated, Final
 from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
-from ucfrec.results.rows import ResultRow, latest, read_rows
+from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
-from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.methods import MAIN, PAPER_ABLATIONS, PAPER_UCF, ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.plan import robustness_cells, score_cells
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import ControlGridOptions
@@ -63,20 +63,25 @@ class Part:
 
 _BASELINES = ("dt", "dt-wo-time", "dc", "dc-wo-time", "lsdt", "lsdt-wo-time")
 _DETERMINISTIC = (CLEAN, "deterministic")
-_EVALUATED = ("dt-wo-time", "dc-wo-time", "ucf", "ucf-dropped")
+_EVALUATED = ("dt-wo-time", "dc-wo-time", PAPER_UCF, "ucf", "ucf-dropped")
+_BOTH = (PAPER_UCF, "ucf")
 PARTS: Final[Mapping[str, Part]] = {
-    "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, "ucf-paper", "ucf")),
-    "table-3": Part(MAIN, ("ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES)),
+    "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, *_BOTH)),
+    "table-3": Part(
+        MAIN,
+        (PAPER_UCF, *PAPER_ABLATIONS, "ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES),
+    ),
     "table-9": Part("gate"),
     "table-10": Part("band"),
     "figure-2": Part("lambda"),
     "figure-3": Part(ROBUSTNESS, _EVALUATED, distractors=_DETERMINISTIC),
     "figure-4": Part(ROBUSTNESS, _EVALUATED, distractors=(*_DETERMINISTIC, "stochastic")),
-    "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), of_runs=True),
-    "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), of_runs=True),
+    "figure-5": Part(MAIN, _BOTH, ("hopper_medium-zoo",), of_runs=True),
+    "figure-6": Part(MAIN, _BOTH, ("halfcheetah_medium-zoo",), of_runs=True),
 }
-"""By name. Table 2 is `ucfrec benchmark recommendation`, tables 4 to 8 are settings, and figure 1
-is a diagram of the method."""
+"""By name. Each has rows with the paper's settings and generator beside those of `ucf`, whose moves
+are drawn from the band. Table 2 is `ucfrec benchmark recommendation`, tables 4 to 8 are settings,
+and figure 1 is a diagram of the method."""
 
 
 class Reproduce(ControlGridOptions):
@@ -108,7 +113,8 @@ class Reproduce(ControlGridOptions):
         else:
             cells += part.cells(self.require_data(), self.out, budget)
             how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-            rows = self.make_rows("", (), lambda: cells, how, f"reproduce {self.part}")
+            with benchmarking(results):
+                rows = self.measure(cells, how, f"reproduce {self.part}")
         pictures = self.out / self.part
         with self.explain_rows():
             if robust:
@@ -116,7 +122,7 @@ class Reproduce(ControlGridOptions):
             else:
                 print_scores(rows, part.table)
             if part.of_runs:
-                runs = [cell.run for cell in cells if cell.run is not None]
+                runs = [c.run for c in cells if c.run is not None and c.training_seed == 0]
                 files, _ = make_figures(runs, [], pictures)
             else:
                 files = make_row_figures(rows, pictures)

@@ -11,11 +11,9 @@ from ucfrec_control.benchmark.plan import robustness_cells
 from ucfrec_control.benchmark.robustness import (
     SHOWN,
     SHOWN_LARGEST,
-    SHOWN_LOSSES,
     SHOWN_SCREENING,
     drops,
     largest_drops,
-    loss_rises,
     screening_rows,
 )
 from ucfrec_control.commands.options import SuiteOptions
@@ -35,8 +33,7 @@ class Robustness(SuiteOptions):
 def print_robustness(rows: Sequence[ResultRow]) -> None:
     """Print what distractors cost, and what screening found."""
     by = ("task", "distractor", "method")
-    for lines, values in ((drops(rows), SHOWN), (loss_rises(rows), SHOWN_LOSSES)):
-        print(f"{format_rows(average_seeds(lines, by, values), (*by, *values))}\n")
+    print(f"{format_rows(average_seeds(drops(rows), by, SHOWN), (*by, *SHOWN))}\n")
     print("largest loss of a method over datasets and distractors, % of the clean score")
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     # A store is screened once, whatever method and seed it is for.

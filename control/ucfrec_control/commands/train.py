@@ -4,11 +4,20 @@ from typing import Annotated
 
 import torch
 
-from ucfrec.commands.options import Names
+from ucfrec.commands.options import POSITIVE, Names
 from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.training.train import control_policies, dataset_of, preset_of, train_control
+from ucfrec_control.environments.environments import environment_of_data
+from ucfrec_control.training.selection import select_by_return
+from ucfrec_control.training.train import (
+    control_policies,
+    dataset_of,
+    describe_returns,
+    preset_of,
+    train_control,
+)
 
 
 class Train(TrainingOptions):
@@ -16,6 +25,9 @@ class Train(TrainingOptions):
 
     policy: Annotated[str, "NAME", Names(control_policies, closed=True)] = "ucf"
     """Policy."""
+    select_by_return: Annotated[int | None, POSITIVE, "EPISODES"] = None
+    """Also keep the weights with the highest return in so many episodes at every validation, as
+    checkpoint return (paper, Appendix G.3)"""
 
     def execute(self) -> None:
         """Run `ucfrec-control train`."""
@@ -24,6 +36,11 @@ class Train(TrainingOptions):
         store = EpisodeStore.open(self.store)
         preset = preset_of(dataset_of(store), self.policy)
         config = resolve_config(self.policy, self.config, self.set, self.seed, preset.tables)
-        record = train_control(store, self.out, config, screening=self.screen)
+        callbacks = SILENT
+        if self.select_by_return is not None:
+            env_id = environment_of_data(dataset_of(store))
+            callbacks = select_by_return(self.out, env_id, self.select_by_return)
+        record = train_control(store, self.out, config, screening=self.screen, callbacks=callbacks)
         print(record.describe())
+        print(describe_returns(store))
         print(f"\nrun: {self.out}; TensorBoard can open it")

@@ -34,12 +34,24 @@ class Task:
     def score(self, returns: npt.ArrayLike) -> Float64Array:
         """D4RL's normalised scores of undiscounted returns of any shape: 0 for the random reference
         policy, 100 for the expert."""
-        return 100 * (np.asarray(returns, dtype=np.float64) - self.low) / (self.high - self.low)
+        return normalise(returns, (self.low, self.high))
 
     def d4rl_env(self, dataset: str) -> str | None:
         """Gymnasium's environment of a D4RL dataset of this name, or None if there is none."""
         plain = _plain(dataset)
         return next((env for name, env in self.d4rl_envs.items() if name in plain), None)
+
+
+def normalise(returns: npt.ArrayLike, reference: tuple[float, float]) -> Float64Array:
+    """Scores of returns of any shape: 0 for the lower return of the reference, 100 for the higher.
+
+    Raises:
+        InputError: the second return of the reference is not above the first.
+    """
+    low, high = reference
+    if not low < high:
+        raise InputError(f"--reference {low:g} {high:g}: the second return must be the higher one")
+    return 100 * (np.asarray(returns, dtype=np.float64) - low) / (high - low)
 
 
 def _plain(name: str) -> str:
@@ -69,20 +81,6 @@ def find_task(name: str | None, other: str | None = None) -> Task | None:
     belongs to one."""
     plain = [_plain(text or "") for text in (name, other)]
     return next((task for text in plain for task in TASKS if task.pattern in text), None)
-
-
-def require_task(name: str | None, other: str | None = None) -> Task:
-    """As `find_task`.
-
-    Raises:
-        InputError: no name matches a task.
-    """
-    if task := find_task(name, other):
-        return task
-    raise InputError(
-        f"no reference returns are known for {' or '.join(filter(None, (name, other))) or 'it'}; "
-        f"scores are for {', '.join(task.name for task in TASKS)}"
-    )
 
 
 # The first match counts. "medium" comes after the longer names that contain it, and after

@@ -171,7 +171,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):
-        raise InputError(f"{run} is of {trained.name}; attention is drawn of ucf")
+        raise InputError(f"{run} is of {trained.name}; attention is drawn of ucf and ucf-paper")
     view, k = training_views(store_of(run))[1], trained.policy.config.context
     episodes, ends = view.all_steps()
     full = np.flatnonzero(ends >= k - 1)

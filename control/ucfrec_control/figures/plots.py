@@ -158,32 +158,6 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 
 @file_style()
-def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
-    """Return reached over target return, a line a method: mean over seeds, lowest to highest around
-    it. On the dashed line, the target is reached.
-
-    Args:
-        rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
-    """
-    figure, axes = _figure(COLUMN, 2.5, title, "target return", "return achieved")
-    reached = _group_seeds(rows, ("method", "target_return"), "return")
-    for method, color in colors(sorted({row["method"] for row in rows})).items():
-        at = sorted(target for name, target in reached if name == method)
-        returns = [reached[method, target] for target in at]
-        means = [summary(values).mean for values in returns]
-        axes.plot(at, means, "o-", color=color, label=label(method))
-        low, high = (list(map(end, returns)) for end in (min, max))
-        axes.fill_between(at, low, high, color=color, alpha=0.2, lw=0)
-    targets, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
-    axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
-    axes.set_xlim(0, 1.03 * max(targets))
-    axes.set_ylim(0, 1.1 * top)
-    axes.grid(True)
-    _legend_below(figure, axes, 4)
-    return figure
-
-
-@file_style()
 def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
     """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
 
@@ -242,30 +216,6 @@ def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     for axes in panels[len(tasks) :]:
         axes.set_visible(False)
     figure.supxlabel("normalised score", fontsize=8)
-    return figure
-
-
-@file_style()
-def training_curves(
-    curves: Mapping[str, Sequence[Mapping[int, float]]], ylabel: str, title: str = ""
-) -> Figure:
-    """A value over training steps, a line a method: mean over seeds, lowest to highest around it.
-
-    Args:
-        curves: for each method, {step: value} of each seed; steps that not all seeds have are left
-            out.
-    """
-    figure, axes = _figure(COLUMN, 2.5, title, "training step", ylabel)
-    for method, color in colors(curves).items():
-        first, *later_seeds = seeds = curves[method]
-        steps = sorted(step for step in first if all(step in seed for seed in later_seeds))
-        values = np.array([[seed[step] for step in steps] for seed in seeds])
-        axes.plot(steps, values.mean(axis=0), color=color, label=label(method))
-        low, high = values.min(axis=0), values.max(axis=0)
-        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-    axes.set_xlim(left=0)
-    axes.grid(True)
-    _legend_below(figure, axes, 4)
     return figure
 
 

@@ -7,18 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import rollout
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.acting.rollout import Episodes, rollout
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
-from ucfrec.runs.screened import drop_columns
-from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
@@ -29,12 +25,14 @@ from ucfrec_control.environments.environments import (
     make_env,
     mismatches,
 )
-from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.environments.scores import find_kind, find_task, normalise
 from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, read_run
 from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
+RETURN = "return"
+"""Checkpoint of `ucfrec_control.training.selection`."""
 NO_TARGET = "no target return"
 _SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
 EVALUATE = "evaluate"
@@ -50,8 +48,10 @@ def evaluate_run(
     targets: Sequence[float | None] = (),
     checkpoints: Sequence[str] = CHECKPOINTS,
     distractor: float = 0.0,
+    reference: tuple[float, float] | None = None,
 ) -> list[ResultRow]:
-    """One result row for each checkpoint and target return.
+    """One result row for each checkpoint and target return; a score where reference returns are
+    known, the return otherwise.
 
     All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
     checkpoint; they and behaviour cloning take no target return.
@@ -60,13 +60,15 @@ def evaluate_run(
         seed: of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
-            for those of the preset, or that one if the policy was trained to know it.
-        checkpoints: "last", "best" or both.
+            for those of the preset, else the run's own, or the largest expected if the policy was
+            trained to know it.
+        checkpoints: of "last", "best" and, where the training selected by return, "return".
         distractor: value that every distractor is fixed to (Appendix G.4: 0).
+        reference: returns with scores 0 and 100; None for D4RL's of the task, if there are any.
 
     Raises:
         InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
-            environment is unknown or cannot be made.
+            environment is unknown or cannot be made, or `reference` does not rise.
     """
     if episodes < 1:
         raise InputError(f"--episodes is {episodes}; at least one is needed")
@@ -82,7 +84,7 @@ def evaluate_run(
             continue
         environment = environment_of(trained, env_id)
         for rule in rules_of(trained, environment, targets):
-            row = _row(trained, environment, rule, episodes, seed, distractor)
+            row = _row(trained, environment, rule, episodes, seed, distractor, reference)
             rows.append(replace(row, checkpoint=checkpoint))
     return rows
 
@@ -162,17 +164,35 @@ def takes_target(record: RunRecord | RLRecord) -> bool:
 
 
 def rules_of(
-    trained: Trained, env_id: str, targets: Sequence[float | None] = ()
+    trained: Trained, env_id: str | None, targets: Sequence[float | None] = ()
 ) -> Sequence[DecisionRule | None]:
-    """The target returns given, else those of the preset, as rules; (None,) for policies without a
-    target return."""
+    """The target returns given, else those of the preset, as rules, else the run's own rule;
+    (None,) for policies without a target return."""
     dataset, method = _dataset(trained), trained.record.config.policy_name
     if isinstance(trained, RLPolicy) or not takes_target(trained.record):
         return (None,)
-    task = require_task(env_id, dataset["dataset"])
-    preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets
+    name, kind = dataset["dataset"], find_kind(dataset["dataset"])
+    task = find_task(env_id or dataset["env_id"], name)
+    preset = find_preset(task.name if task else "", kind, method).targets
     default = (None,) if trained.policy.config.max_return else preset
-    return [DecisionRule(target) for target in targets or default]
+    return [DecisionRule(target) for target in targets or default] or [trained.rule]
+
+
+def play(
+    trained: Trained,
+    env_id: str,
+    rule: DecisionRule | None,
+    episodes: int,
+    seed: int,
+    distractor: float = 0.0,
+) -> Episodes:
+    """Roll out `episodes` episodes; arguments and errors as of `open_environment`."""
+    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
+    try:
+        actor = trained.actor(env.num_envs, rule)
+        return rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+    finally:
+        env.close()
 
 
 def _row(
@@ -182,18 +202,17 @@ def _row(
     episodes: int,
     seed: int,
     distractor: float,
+    reference: tuple[float, float] | None,
 ) -> ResultRow:
     record, dataset = trained.record, _dataset(trained)
-    task = require_task(env_id, dataset["dataset"])
+    task = find_task(env_id, dataset["dataset"])
+    scale = reference or ((task.low, task.high) if task else None)
     began = time.perf_counter()
-    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
-    try:
-        actor = trained.actor(env.num_envs, rule)
-        rolled_out = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
-    finally:
-        env.close()
+    rolled_out = play(trained, env_id, rule, episodes, seed, distractor)
     seconds = time.perf_counter() - began
-    low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
+    returns = rolled_out.returns
+    scores = None if scale is None else normalise(returns, scale)
+    low, high = bootstrap_interval(returns if scores is None else scores, seed)
     conditions: dict[str, Any] = {"episodes": episodes, "distractor_fixed_to": distractor}
     conditions["lambda_mask"] = record.settings["policy"].get("lambda_mask")
     row = ResultRow(
@@ -207,9 +226,9 @@ def _row(
         conditions=conditions,
         config_hash=config_hash(record.settings),
         data_fingerprint=record.fingerprint,
-        metric="score",
+        metric="return" if scores is None else "score",
         metrics={},
-        interval=(float(low), float(high)),
+        interval=(low, high),
         environment=env_id,
         target_return=None if rule is None else rule.target,
         rule=NO_TARGET if rule is None else str(rule),
@@ -217,9 +236,9 @@ def _row(
         **provenance(PACKAGES),
     )
     metrics = {
-        "score": float(task.score(rolled_out.returns.mean())),
-        "score_std": summary(task.score(rolled_out.returns)).sd if episodes > 1 else None,
-        "return": float(rolled_out.returns.mean()),
+        "score": None if scores is None else float(scores.mean()),
+        "score_std": None if scores is None or episodes < 2 else summary(scores).sd,
+        "return": float(returns.mean()),
         "length": float(rolled_out.lengths.mean()),
         "steps": record.finished.steps,
         "best_step": record.finished.best_step,
@@ -231,33 +250,3 @@ def _row(
         "warnings": mismatches(dataset, env_id) or None,
     }
     return row.extended(metrics)
-
-
-_BATCHES, _BATCH = 8, 512
-
-
-@torch.no_grad()
-def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, float]:
-    """Mean action loss at 4,096 steps of validation episodes.
-
-    Unlike scores, the losses do not vary with the course of the rollout.
-
-    Returns:
-        `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
-    """
-    dropped = trained.record.dropped_observations
-    _, validation = training_views(drop_columns(store, dropped))
-    generator = np.random.default_rng(0)
-    sources = trained.record.data.others.get("distractors", [])
-    distractors = [distractor["dimension"] for distractor in sources]
-    dimensions = [d - sum(lower < d for lower in dropped) for d in distractors if d not in dropped]
-    losses = []
-    for _ in range(_BATCHES):
-        episodes, steps = validation.draw_steps(generator, _BATCH)
-        windows = validation.windows(episodes, steps, trained.policy.config.context)
-        fixed = windows.states.clone()
-        fixed[..., dimensions] = 0.0
-        both = (windows, replace(windows, states=fixed))
-        losses.append([float(trained.policy.action_loss(batch)) for batch in both])
-    loss, at_zero = np.mean(losses, axis=0)
-    return {"loss": float(loss), "loss_at_zero": float(at_zero)}

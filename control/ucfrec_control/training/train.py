@@ -7,13 +7,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.registry import BUILT_IN, policy_names
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.run import OWN, SharedStages
 from ucfrec.runs.screened import train_screened
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
@@ -80,13 +82,26 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 
 
+def describe_returns(store: EpisodeStore) -> str:
+    """What the logged trajectories returned, which a policy is compared with: two lines of text."""
+    dataset, returns = dataset_of(store), np.sort(store.returns)
+    task = find_task(dataset["env_id"], dataset["dataset"])
+    parts = {"behaviour": returns, "best quarter": returns[-max(1, len(returns) // 4) :]}
+    return "\n".join(
+        f"{name:13} mean return {values.mean():.4g} of {len(values):,} logged trajectories"
+        + (f", score {task.score(values.mean()):.1f}" if task else "")
+        for name, values in parts.items()
+    )
+
+
 def train_control(
     store: EpisodeStore,
     out: Path,
     config: Config,
     *,
     screening: str | None = None,
-    shared: SharedStages = OWN,
+    shared: Path | None = None,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """`ucfrec.runs.screened.train_screened` on a control store; `screening` is its `how`.
 
@@ -95,4 +110,6 @@ def train_control(
     """
     dataset_of(store)
     entries = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, entries, shared, screen=screen_store)
+    return train_screened(
+        store, out, config, screening, entries, shared, callbacks, screen=screen_store
+    )

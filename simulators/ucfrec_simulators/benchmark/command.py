@@ -1,16 +1,9 @@
 """`ucfrec benchmark recommendation`: what it measures and shows."""
 
-from functools import partial
 from typing import Final
 
 from ucfrec.benchmark.suite import Benchmark, Shown
-from ucfrec.benchmark.tables import (
-    distractor_table,
-    method_table,
-    plot_distractor,
-    plot_methods,
-    sweep_table,
-)
+from ucfrec.benchmark.tables import distractor_table, method_table, sweep_table
 from ucfrec_simulators.benchmark.measure import MEASUREMENT
 from ucfrec_simulators.benchmark.methods import BUDGETS, COMPONENTS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
@@ -20,12 +13,10 @@ BENCHMARK: Final = Benchmark(
     summary="Table 2 of the paper with built-in policies, ablations, shared components, sweeps of "
     "UCF, a distractor",
     tables={
-        "main": Shown("Methods", method_table, plot_methods),
-        "shared": Shown(
-            "Shared components, one by one", method_table, partial(plot_methods, kind="shared")
-        ),
-        "distractor": Shown("A distractor that causes nothing", distractor_table, plot_distractor),
-        "sweeps": Shown("Settings of UCF", sweep_table, partial(plot_methods, kind="sweeps")),
+        "main": Shown("Methods", method_table),
+        "shared": Shown("Shared components, one by one", method_table),
+        "distractor": Shown("A distractor that causes nothing", distractor_table),
+        "sweeps": Shown("Settings of UCF", sweep_table),
     },
     budgets=BUDGETS,
     tasks=TASKS,

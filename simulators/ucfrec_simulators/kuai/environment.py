@@ -36,15 +36,6 @@ class ExitRule:
     """Occurrences of a tag in the window that a user tolerates."""
     max_turn: int
     """Largest number of steps of a session."""
-    sliced: bool = False
-    """Use the windows of the original code. Its slice `shown[t − window : t]` starts below 0 for
-    t < window, which Python counts from the end, so that step t looks back at only
-    min(t, window − t) items instead of t."""
-
-    def reach(self, turns: IntArray) -> IntArray:
-        """(N,) number of previous items that count in steps `turns` (N,)."""
-        early = np.minimum(turns, self.window - turns) if self.sliced else turns
-        return np.where(turns < self.window, early, self.window)
 
 
 EXITS: Final = {
@@ -56,8 +47,9 @@ EXITS: Final = {
     "dorl-main-explore": ExitRule(window=4, threshold=0, max_turn=30),
     "cirs": ExitRule(window=1, threshold=0, max_turn=30),
 }
-"""Published settings by name; `dorl-main-explore` is that of DORL's UCB and ε-greedy scripts. Use
-`dataclasses.replace(rule, sliced=True)` for exactly what the published code computes."""
+"""Published settings by name; `dorl-main-explore` is that of DORL's UCB and ε-greedy scripts. The
+published code looks back at fewer items in the first steps of a session: its slice
+`shown[t − window : t]` starts below 0, which Python counts from the end."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +157,7 @@ class KuaiEnv(SessionsEnv):
 
     def _tiresome(self, exit_rule: ExitRule) -> BoolArray:
         """(N, n_tags + 1) whether each tag occurred too often; the last column is padding."""
-        size, reach = self._n_tags + 1, exit_rule.reach(self.turns)
+        size, reach = self._n_tags + 1, np.minimum(self.turns, exit_rule.window)
         # One entry per remembered item: its session, and its step in that session.
         rows = np.repeat(np.arange(self.num_envs), reach)
         steps = np.arange(len(rows)) + np.repeat(self.turns - np.cumsum(reach), reach)

@@ -22,8 +22,8 @@ MAX_TURN: Final = 50
 class CirsTaobao(VirtualTaobao):
     """VirtualTaobao's users and clicks; the user leaves when two pages are ranked too similarly.
 
-    A session terminates in the step whose action is within a Euclidean distance of `threshold` of
-    one of the `window` − 1 actions before it, and is truncated after `max_turn` pages. The leave
+    A session terminates in the step whose action is within a Euclidean distance of `THRESHOLD` of
+    one of the `WINDOW` − 1 actions before it, and is truncated after `max_turn` pages. The leave
     network is not used.
 
     Observation (118,): 88 user bits, zero from the second page on; the last action (27), zero on
@@ -31,21 +31,14 @@ class CirsTaobao(VirtualTaobao):
 
     Args:
         folder, num_envs: as for `VirtualTaobao`.
-        window, threshold, max_turn: of the exit rule; the defaults are the published values.
+        max_turn: of the exit rule; the default is the published value.
     """
 
-    def __init__(
-        self,
-        folder: Path | str,
-        num_envs: int = 1,
-        window: int = WINDOW,
-        threshold: float = THRESHOLD,
-        max_turn: int = MAX_TURN,
-    ) -> None:
+    def __init__(self, folder: Path | str, num_envs: int = 1, max_turn: int = MAX_TURN) -> None:
         super().__init__(folder, num_envs)
-        self._threshold, self._max_turn = threshold, max_turn
+        self._max_turn = max_turn
         # Infinity: an empty entry has an infinite distance from every action.
-        self._recent = np.full((num_envs, window - 1, ACTION_DIM), np.inf, dtype=np.float32)
+        self._recent = np.full((num_envs, WINDOW - 1, ACTION_DIM), np.inf, dtype=np.float32)
         limits = np.array([MAX_CLICKS, PAGE_INDICES - 1, max_turn], dtype=np.float32)
         high = np.concatenate([np.ones(USER_BITS + ACTION_DIM, dtype=np.float32), limits])
         low = np.zeros_like(high)
@@ -60,7 +53,7 @@ class CirsTaobao(VirtualTaobao):
     def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         clicks, _, _ = super()._play(actions)
         distances = np.linalg.norm(self._recent - actions[:, None], axis=-1)
-        bored = np.asarray((distances <= self._threshold).any(axis=1))
+        bored = np.asarray((distances <= THRESHOLD).any(axis=1))
         self._recent = np.concatenate([self._recent[:, 1:], actions[:, None]], axis=1)
         return clicks, bored, np.asarray((self._pages >= self._max_turn) & ~bored)
 

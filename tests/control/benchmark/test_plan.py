@@ -29,7 +29,7 @@ from ucfrec_control.benchmark.methods import (
 from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
 from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store
-from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.training.evaluate import load_run
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import find_preset
@@ -37,7 +37,7 @@ from ucfrec_control.training.train import find_preset
 
 def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     """Configuration of every row of a table that the core trains."""
-    task, kind, configs = require_task(file).name, find_kind(file), {}
+    task, kind, configs = find_task(file).name, find_kind(file), {}
     for name, method in TABLES[table].items():
         if method.policy not in ALGORITHMS:
             presets = find_preset(task, kind, method.policy).tables
@@ -65,11 +65,10 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     rows = {table: resolved(table, budget_of(table, "full"), file) for table in TABLES}
     paper = {table: [configs.pop(name) for name in PAPER] for table, configs in rows.items()}
     for name, config in rows["lambda"].items():
-        assert config.policy.lambda_mask == float(name.removeprefix("ucf-lambda-"))
-    for table in ("gate", "band", "augmentation"):
+        assert config.policy.lambda_mask == float(name.rpartition("-")[2])
+    for table in ("gate", "band"):
         for name, config in rows[table].items():
-            kind = next((k for k in ("faithful", "noise") if name.startswith(k)), "tangent")
-            assert config.csg.kind == kind
+            assert config.csg.kind == ("faithful" if name.startswith("ucf-paper") else "tangent")
             assert (config.augment.epsilon_r == 1e9) == name.endswith("wo-gate")
             assert (config.augment.copies == 0) == name.endswith("wo-count")
             assert (config.csg.band[0] == 0) == name.endswith("wo-lower")
@@ -78,8 +77,13 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     for configs in paper.values():
         assert [config.augment.edits_per_copy for config in configs] == [0, 1]
         assert {(c.crm.learning_rate, c.crm.epochs) for c in configs} == {(3e-4, 40)}  # Table 4
-    ablated = rows[MAIN]["ucf-wo-arch"]
+    ablated, of_paper = (rows[MAIN][f"{name}-wo-arch"] for name in ("ucf", "ucf-paper"))
     assert (ablated.policy_name, ablated.augment.copies > 0) == ("dt", True)
+    (whole, _), without = paper[MAIN], rows[MAIN]["ucf-paper-wo-count"]
+    assert of_paper.policy == rows[MAIN]["dt"].policy
+    assert (of_paper.crm, of_paper.csg, of_paper.augment) == (whole.crm, whole.csg, whole.augment)
+    assert replace(without, augment=whole.augment) == whole
+
     steps = {name: config.train.steps for name, config in rows[EQUAL_TIME].items()}
     assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
     assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]
@@ -91,6 +95,19 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         assert policy.advantage_weights == name.endswith(("-weights", "-both"))
         assert policy.max_return == name.endswith(("-max-return", "-both"))
         assert (config.augment.copies > 0) == (name.startswith("ucf") and "-wo-count" not in name)
+
+
+@pytest.mark.parametrize("size", BUDGETS)
+def test_a_budget_shortens_the_papers_training_and_changes_nothing_else(size: str) -> None:
+    for file in budget_of(MAIN, size).tasks:
+        presets = find_preset(find_task(file).name, find_kind(file), "ucf-paper").tables
+        preset = resolve_config("ucf-paper", presets=presets)
+        config = resolved(MAIN, budget_of(MAIN, size), file)["ucf-paper"]
+        share = config.train.steps / preset.train.steps
+        assert config.train.warmup_steps == preset.train.warmup_steps * share
+        lengths = ("steps", "warmup_steps", "validate_every")
+        own = {name: getattr(preset.train, name) for name in lengths}
+        assert replace(config, train=replace(config.train, **own)) == preset
 
 
 @pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=8.5", "ucf=9999999"])
@@ -115,6 +132,8 @@ def test_a_row_has_the_rate_of_its_policy(table: str, monkeypatch: pytest.Monkey
     rates = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
     monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
     for name, method in TABLES[table].items():
+        if name.startswith("ucf-paper"):
+            continue  # the paper's own
         settings = settings_of(BUDGETS["full"], name, method)
         searched = next(m for m, row in SEARCHED.items() if row.policy == method.policy)
         own = "" if method.policy in ALGORITHMS else "train."

@@ -24,6 +24,7 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     for size in BUDGETS:
         own = part.budget(size)
         assert own.tasks == (part.files or budget_of(part.table, size).tasks)
+    assert "ucf-paper" in (part.methods or TABLES[part.table])
     assert set(part.distractors) <= set(DISTRACTORS)
     assert part.of_runs == (name in ("figure-5", "figure-6"))
 
@@ -33,10 +34,18 @@ def test_one_command_makes_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     settings = (*TINY, "crm.epochs=1", "csg.epochs=1")
     tiny = Budget("small", ("unused",), 1, Evaluation(1, 1000), settings)
     monkeypatch.setitem(BUDGETS, "small", tiny)
-    said = control("reproduce", "figure-5", "--data", tmp_path, "--out", tmp_path / "out")[1]
-    assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
-    assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
-    assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
+    where = ("--data", tmp_path, "--out", tmp_path / "out", "--context", "ucf-paper=5")
+    printed, said = control("reproduce", "figure-5", *where)
+    assert "reproduce figure-5: 2 cells, 2 of them left to measure" in said
+    rows = read_rows(tmp_path / "out" / "results.jsonl")
+    assert {row.method for row in rows} == {"ucf", "ucf-paper"}
+    assert {row.details.get("updates") for row in rows} == {
+        None,
+        "the paper's settings, 0.004% of its updates",
+    }
+    assert "ucf-paper…: the paper's settings, 0.004% of its updates" in printed
+    for kind in ("moves", "acceptance", "attention"):
+        assert len(list((tmp_path / "out" / "figure-5").glob(f"{kind}-*.png"))) == 2
 
 
 def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
@@ -52,9 +61,11 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
             for own in [{"training_seed": seed, "conditions": conditions}]
         ]
         made = {file.name for file in make_row_figures(rows, tmp_path)}
-        wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
+        wanted = "robustness-small-d.png" if robust else f"scores-small-{part.table}.png"
         assert wanted in made
-    assert (tmp_path / "lambda-small.png").exists()
+    assert {*tmp_path.glob("lambda-*.png")} == {
+        tmp_path / f"lambda-small{family}.png" for family in ("", "-ucf-paper")
+    }
 
 
 def small(**conditions: object) -> dict[str, object]:

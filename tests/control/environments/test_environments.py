@@ -22,7 +22,7 @@ from ucfrec.results.rows import read_results
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
 from ucfrec_control.environments.environments import antmaze_settings, make_env, mismatches
-from ucfrec_control.environments.scores import require_task
+from ucfrec_control.environments.scores import find_task
 from ucfrec_control.training.evaluate import load_run, open_environment
 
 needs_robotics = pytest.mark.skipif(
@@ -132,7 +132,7 @@ def test_a_success_ends_the_episode_and_scores_a_hundred(env_id: str) -> None:
     env.close()
     assert played.returns.tolist() == [1, 0, 1, 0]
     assert played.lengths.tolist() == [3, 8, 3, 8]
-    assert require_task(env_id).score(played.returns).tolist() == [100, 0, 100, 0]
+    assert find_task(env_id).score(played.returns).tolist() == [100, 0, 100, 0]
 
 
 @pytest.fixture(scope="module")
@@ -196,9 +196,9 @@ def test_names_of_d4rl_tell_its_environments() -> None:
         ("medium", "antmaze-medium-play-v2", file.format("big")),
         ("large", "antmaze-large-diverse-v2", file.format("hardest")),
     ):
-        found = {require_task(name).d4rl_env(name) for name in names}
+        found = {find_task(name).d4rl_env(name) for name in names}
         assert found == {f"d4rl/antmaze-{maze}-v2"}
-    assert require_task("antmaze").d4rl_env("antmaze-mine") is None
+    assert find_task("antmaze").d4rl_env("antmaze-mine") is None
 
 
 def test_without_robotics_the_extra_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

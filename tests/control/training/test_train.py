@@ -5,6 +5,7 @@ import sys
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.support.control_files import (
@@ -17,11 +18,11 @@ from tests.support.control_files import (
     write_made,
 )
 from tests.support.real_data import data_folder
-from ucfrec.acting.rollout import Step, Uniform, rollout
+from ucfrec.acting.rollout import Episodes, Step, Uniform, rollout
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
-from ucfrec.fitting.checkpoint import read_metrics
+from ucfrec.fitting.checkpoint import load_tensors, read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.results.rows import read_results, read_rows
 from ucfrec.runs.config import resolve_config
@@ -30,6 +31,7 @@ from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.environments.environments import make_env
 from ucfrec_control.environments.scores import TASKS
+from ucfrec_control.training import selection
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.train import find_preset, train_control
 
@@ -98,6 +100,26 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     steps: list[Step] = []
     rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)
     assert not any(step.observations[:, 11].any() for step in steps)
+
+
+def test_the_weights_of_the_highest_validation_return_are_kept(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    returns, out = iter((3.0, 5.0, 4.0)), tmp_path / "rows.json"
+
+    def play(*arguments: object) -> Episodes:
+        return Episodes(np.array([next(returns)]), np.array([1]))
+
+    monkeypatch.setattr(selection, "play", play)
+    where = (folder / "store", "--out", tmp_path / "run", "--policy", "dt")
+    longer = set_options((*TINY, "train.steps=6"))
+    control("train", *where, *longer, "--select-by-return", 1)
+    _, about = load_tensors(tmp_path / "run" / "policy" / "return.safetensors")
+    assert about == {"step": 4, "return": 5.0}
+    asked = ("--episodes", 1, "--checkpoint", "return", "--json", out)
+    control("evaluate", tmp_path / "run", *asked)
+    assert {row.checkpoint for row in read_results(out)} == {"return"}
+    assert "return.safetensors does not exist" in refused("evaluate", folder / "store-run", *asked)
 
 
 def test_policies_that_know_their_return_are_asked_for(store: EpisodeStore, tmp_path: Path) -> None:

@@ -1,0 +1,228 @@
+"""Fitted Q evaluation of a policy from logged trajectories, and why not to rely on it.
+
+Q(s, a) = w·φ(s, a) with random features is regressed on r + γ Q(s', π(h')), again and again (Le,
+Voloshin & Yue, ICML 2019). The policy chooses after the logged history h', so its memory counts.
+Sums over groups of trajectories give both the estimate and its jackknife interval.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.stats import t as student
+
+from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.arrays import Array, Float64Array, IntArray
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions
+from ucfrec.errors import InputError
+from ucfrec.runs.screened import drop_columns
+from ucfrec_control.training.evaluate import Trained
+from ucfrec_control.training.rl_baselines import RLPolicy
+
+_FEATURES: Final = 256
+_STEPS_PER_FEATURE: Final = 20
+_GROUPS: Final = 20
+_DOUBLINGS: Final = 16
+"""Of the number of regressions, from one."""
+_RIDGE: Final = 1e-3
+_BATCH: Final = 1024
+_FAR: Final = 0.5
+"""Share of the variance of logged actions that the policy's may be off by."""
+_BIASED: Final = 0.1
+"""Standard deviations of logged returns that the behaviour's own estimate may be off by."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The discounted return of an episode, from its first step."""
+
+    value: float | None
+    """None if the regressions did not settle, as then the interval is."""
+    interval: tuple[float, float] | None
+    """95%, over trajectories; None of fewer trajectories than groups."""
+    behaviour: float
+    """Mean of the logged trajectories."""
+    best_quarter: float
+    """Mean of the quarter with the highest returns."""
+    reasons: tuple[str, ...]
+    """Not to rely on the value; empty for none."""
+
+
+def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeStore) -> Array:
+    """What the policy would do at every logged step (N, A), after the logged history."""
+    if isinstance(trained, RLPolicy):
+        return trained.act(store.column(schema.OBSERVATION), np.ones(store.n_steps, dtype=bool))[0]
+    scorer, parts = trained.scorer(rule), []
+    for episodes, steps in store.step_batches():
+        logged = store.windows(episodes, steps, trained.policy.config.context)
+        sessions = Sessions(
+            logged.actions[:, :-1],
+            logged.rewards[:, :-1],
+            torch.from_numpy(steps),
+            torch.from_numpy(store.rewards_before(episodes, steps)),
+            torch.full((len(steps),), -1),
+            states=logged.states,
+        )
+        parts.append(scorer.act(sessions).numpy())
+    return np.concatenate(parts)
+
+
+def estimate(
+    trained: Trained, rule: DecisionRule | None, store: EpisodeStore, discount: float = 0.99
+) -> Estimate:
+    """Estimate the discounted return of a policy from the store that it was trained on.
+
+    Of trajectories that the step limit ended, the last step is not regressed, because the state
+    after it is unknown; the behaviour's return goes on with the estimate there.
+
+    Raises:
+        InputError: `discount` is not in (0, 1), the store is of other sizes, or no trajectory has
+            two steps.
+    """
+    if not 0 < discount < 1:
+        raise InputError(f"--discount is {discount:g}; give a number between 0 and 1")
+    sizes = trained.record.sizes
+    dropped = trained.record.dropped_observations
+    expected = (sizes["state"] + len(dropped), sizes["action"])
+    stored = (store.observation_size, *store.record.columns[schema.ACTION])
+    if store.has_items or stored != expected:
+        raise InputError(
+            f"{store.path}: observations and actions have sizes {stored}, the policy was trained "
+            f"on {expected}; name a store of the same robot"
+        )
+    store = drop_columns(store, dropped)
+    if store.lengths.max() < 2:
+        raise InputError(f"{store.path}: no trajectory has two steps; log longer ones")
+    logged, chosen = store.column(schema.ACTION), choose_actions(trained, rule, store)
+    model, variance = _Model(store, discount), logged.var(axis=0)
+    apart = np.square(chosen - logged).mean(axis=0)[variance > 0]
+    distance = float((apart / variance[variance > 0]).mean()) if len(apart) else 0.0
+    of_behaviour, of_policy = model.fit(logged), model.fit(chosen)
+    settled, few = of_policy.settled and of_behaviour.settled, len(store.lengths) < _GROUPS
+    returns, half, value = model.logged_returns(of_behaviour.weights), 0.0, of_policy.value
+    reasons = []
+    if not settled:
+        reasons.append("the regressions did not settle")
+    if few:
+        reasons.append(f"of fewer than {_GROUPS} trajectories there is no interval")
+    else:
+        half = of_policy.half_width
+    if distance > _FAR:
+        reasons.append(
+            f"the policy's actions are far from the logged ones ({distance:.2g} of their variance, "
+            f"at most {_FAR:g}), so the log does not show what they lead to"
+        )
+    mean, spread = float(returns.mean()), float(returns.std())
+    allowed = _BIASED * spread + (0.0 if few else of_behaviour.half_width)
+    if settled and abs(of_behaviour.value - mean) > allowed:
+        reasons.append(
+            f"the same method says {of_behaviour.value:.4g} of the behaviour, which returned "
+            f"{mean:.4g}"
+        )
+    if settled and not returns.min() <= value <= returns.max():
+        reasons.append(
+            f"the value is outside of what was logged ({returns.min():.4g} to {returns.max():.4g})"
+        )
+    return Estimate(
+        value=value if settled else None,
+        interval=(value - half, value + half) if settled and not few else None,
+        behaviour=mean,
+        best_quarter=float(np.sort(returns)[-max(1, len(returns) // 4) :].mean()),
+        reasons=tuple(reasons),
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    weights: Float64Array
+    value: float
+    half_width: float
+    """Of the 95% interval; infinite of fewer trajectories than groups."""
+    settled: bool
+
+
+class _Model:
+    """Features of a store's steps, and the regressions on them."""
+
+    def __init__(self, store: EpisodeStore, discount: float) -> None:
+        self._lengths, self._discount = store.lengths, discount
+        self._starts = np.cumsum(self._lengths) - self._lengths
+        mean, std = (values.numpy() for values in store.state_statistics)
+        self._states = (store.column(schema.OBSERVATION) - mean) / np.where(std > 1e-6, std, 1.0)
+        self._rewards = store.column(schema.REWARD).astype(np.float64)
+        self._logged = store.column(schema.ACTION)
+        self._scale = np.maximum(self._logged.std(axis=0), 1e-6)
+        size, rng = self._states.shape[1] + self._logged.shape[1], np.random.default_rng(0)
+        waves = min(_FEATURES, store.n_steps // _STEPS_PER_FEATURE)
+        self._slopes = rng.normal(0, size**-0.5, (size, waves))
+        self._phases = rng.uniform(0, 2 * np.pi, waves)
+        self._ends, self._cut = self._starts + self._lengths - 1, ~store.terminated.astype(bool)
+        self._groups = min(_GROUPS, len(self._lengths))
+
+    def _features(self, rows: IntArray, actions: Array) -> Float64Array:
+        """φ (M, F) of steps `rows` (M,) with the actions (N, A) of all steps."""
+        inputs = np.hstack([self._states[rows], actions[rows] / self._scale]).astype(np.float64)
+        waves = np.cos(inputs @ self._slopes + self._phases)
+        return np.hstack([waves, inputs, np.ones((len(rows), 1))])
+
+    def fit(self, chosen: Array) -> _Fit:
+        """Q of a policy with the actions `chosen` (N, A) at all steps."""
+        sums = [self._sum(group, chosen) for group in range(self._groups)]
+        total = [np.sum(parts, axis=0) for parts in zip(*sums, strict=True)]
+        weights, value, settled = self._solve(total)
+        if self._groups < _GROUPS:
+            return _Fit(weights, value, np.inf, settled)
+        without = [
+            self._solve([whole - part for whole, part in zip(total, parts, strict=True)])
+            for parts in sums
+        ]
+        values = np.array([value for _, value, _ in without])
+        spread = np.sqrt((_GROUPS - 1) * values.var())
+        settled = settled and all(ended for *_, ended in without)
+        return _Fit(weights, value, float(student.ppf(0.975, _GROUPS - 1) * spread), settled)
+
+    def _sum(self, group: int, chosen: Array) -> tuple[Array, ...]:
+        """Σ φφᵀ, Σ φφ'ᵀ, Σ φr, Σ φ of first steps, and their number, of a group of trajectories."""
+        mine = np.arange(len(self._lengths)) % self._groups == group
+        known = np.repeat(mine, self._lengths)
+        known[self._ends[self._cut]] = False
+        ends, rows = np.zeros(len(known), dtype=bool), np.flatnonzero(known)
+        ends[self._ends] = True
+        first = self._features(self._starts[mine], chosen).sum(0)
+        squares, products = np.zeros((2, len(first), len(first)))
+        rewards = np.zeros(len(first))
+        for part in np.array_split(rows, -(-len(rows) // _BATCH) or 1):
+            now = self._features(part, self._logged)
+            later = self._features(np.minimum(part + 1, len(known) - 1), chosen)
+            later[ends[part]] = 0.0
+            squares += now.T @ now
+            products += now.T @ later
+            rewards += now.T @ self._rewards[part]
+        return squares, products, rewards, first, np.array(mine.sum())
+
+    def _solve(self, sums: list[Array]) -> tuple[Float64Array, float, bool]:
+        """Weights, mean value of the first steps, and whether the regressions settled."""
+        squares, products, rewards, first, count = sums
+        ridge = _RIDGE * np.trace(squares) / len(squares) * np.eye(len(squares))
+        solved = np.linalg.solve(squares + ridge, np.column_stack([rewards, products]))
+        weights, matrix = solved[:, 0], self._discount * solved[:, 1:]
+        size, settled = np.abs(weights).max(), False
+        for _ in range(_DOUBLINGS):  # w + M w + … + Mⁿ w of n = 1, 3, 7, … regressions
+            change = matrix @ weights
+            weights, matrix = weights + change, matrix @ matrix
+            settled = bool(np.abs(change).max() <= 1e-6 * np.abs(weights).max())
+            if settled or np.abs(change).max() > 1e9 * size:
+                break
+        return weights, float(first @ weights / count), settled
+
+    def logged_returns(self, weights: Float64Array) -> Float64Array:
+        """Discounted returns (E,) of the logged trajectories; where the step limit cut one, its
+        last step counts by Q."""
+        steps = np.arange(len(self._rewards)) - np.repeat(self._starts, self._lengths)
+        rewards = self._rewards.copy()
+        cut = self._ends[self._cut]
+        rewards[cut] = self._features(cut, self._logged) @ weights
+        return np.add.reduceat(rewards * self._discount**steps, self._starts)

@@ -1,0 +1,131 @@
+"""From raw trajectories of one's own robot to an action, in Python and in onnxruntime."""
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from tests.support.control_files import TINY, control, refused, set_options, write_hdf5
+from tests.support.markdown import ROOT
+from ucfrec.errors import InputError
+from ucfrec.results.rows import read_results
+from ucfrec_control import ControlPolicy
+
+EPISODES = ("--episodes", 2, "--checkpoint", "last")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`run` of a Pendulum, whose returns no reference is known for, from an HDF5 file."""
+    made = tmp_path_factory.mktemp("pendulum")
+    env, rng = gymnasium.make("Pendulum-v1", max_episode_steps=40), np.random.default_rng(0)
+    names = ("observations", "actions", "rewards", "terminals", "timeouts")
+    columns: dict[str, list[object]] = {name: [] for name in names}
+    for seed in range(24):
+        observation, ended = env.reset(seed=seed)[0], False
+        while not ended:
+            action = rng.uniform(-2, 2, 1).astype(np.float32)
+            following, reward, terminated, truncated, _ = env.step(action)
+            step = (observation, action, reward, terminated, truncated)
+            for name, value in zip(names, step, strict=True):
+                columns[name].append(value)
+            observation, ended = following, terminated or truncated
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    file = write_hdf5(made / "pendulum.hdf5", arrays, env_id="Pendulum-v1")
+    control("prepare", file, "--out", made / "store")
+    for policy in ("ucf", "bc"):
+        where = (made / "store", "--out", made / policy, "--policy", policy)
+        said = control("train", *where, *set_options(TINY if policy == "ucf" else TINY[:3]))[0]
+        returns = np.add.reduceat(arrays["rewards"], np.arange(0, 960, 40))
+        assert f"behaviour     mean return {returns.mean():.4g} of 24" in said
+        assert f"best quarter  mean return {np.sort(returns)[-6:].mean():.4g} of 6" in said
+    (made / "run").symlink_to(made / "ucf")
+    return made
+
+
+Steps = list[np.ndarray]
+
+
+def play(policy: ControlPolicy, steps: int) -> tuple[Steps, Steps, list[float]]:
+    env = gymnasium.make("Pendulum-v1")
+    observations, actions, rewards = [env.reset(seed=3)[0]], [], []
+    policy.reset()
+    for _ in range(steps):
+        actions.append(policy.act(observations[-1], rewards[-1] if rewards else None))
+        observation, reward, *_ = env.step(actions[-1])
+        observations.append(observation)
+        rewards.append(float(reward))
+    return observations, actions, rewards
+
+
+@pytest.mark.parametrize("name", ["ucf", "bc"])
+def test_onnxruntime_acts_as_python_does(folder: Path, tmp_path: Path, name: str) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="needs ucfrec[export]")
+    control("export", folder / name, "--out", tmp_path / "graph")
+    described = json.loads((tmp_path / "graph" / "model.json").read_text())
+    session = onnxruntime.InferenceSession(str(tmp_path / "graph" / "model.onnx"))
+    assert described["inputs"].keys() == {entry.name for entry in session.get_inputs()}
+    policy, k = ControlPolicy.load(folder / name), described["context"]
+    observations, actions, rewards = play(policy, 3 * k + 2)
+    play(policy, 2)  # an episode before must not count
+    assert [row.tolist() for row in play(policy, 5)[1]] == [row.tolist() for row in actions[:5]]
+    for step, action in enumerate(actions):
+        window = {
+            "observations": np.zeros((1, k, 3), dtype=np.float32),
+            "actions": np.zeros((1, k, 1), dtype=np.float32),
+            "rewards": np.zeros((1, k), dtype=np.float32),
+        }
+        seen = min(k, step + 1)
+        window["observations"][0, k - seen :] = observations[step + 1 - seen : step + 1]
+        window["actions"][0, k - seen : -1] = actions[step + 1 - seen : step] or np.zeros((0, 1))
+        window["rewards"][0, k - seen : -1] = rewards[step + 1 - seen : step]
+        window["steps"] = np.array([step])
+        left = (described["target_return"] or 0.0) - sum(rewards[:step])
+        window["target_return"] = np.array([left], dtype=np.float32)
+        inputs = {key: value for key, value in window.items() if key in described["inputs"]}
+        np.testing.assert_allclose(session.run(None, inputs)[0][0], action, atol=1e-5)
+
+
+def test_the_documented_lines_act(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    runpy.run_path(str(ROOT / "examples" / "control_loop.py"))
+    total = float(capsys.readouterr().out.split()[1])
+    control("evaluate", "run", "--episodes", 1, "--seed", 0, "--json", folder / "rows.json")
+    assert total == pytest.approx(read_results(folder / "rows.json")[0]["return"], abs=0.06)
+
+
+def test_returns_are_raw_without_references(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "rows.json"
+    control("evaluate", folder / "run", *EPISODES, "--json", out)
+    (row,) = read_results(out)
+    assert (row.metric, "score" in row.metrics) == ("return", False)
+    assert row.interval is not None
+    assert row.interval[0] <= row.value == row["return"] <= row.interval[1]
+    control("evaluate", folder / "run", *EPISODES, "--reference", -900, -100, "--json", out)
+    (scored,) = read_results(out)
+    assert scored.value == pytest.approx((row.value + 900) / 8)
+    said = refused("evaluate", folder / "run", *EPISODES, "--reference", 5, 5)
+    assert "the second return must be the higher one" in said
+
+
+def test_observations_that_do_not_fit_are_refused(folder: Path) -> None:
+    policy = ControlPolicy.load(folder / "run", target=-100.0)
+    assert policy.rule is not None
+    assert policy.rule.target == -100
+    for observation, says in (([0.0, 1.0], "vectors of 3"), ([0.0, np.nan, 1.0], "not finite")):
+        with pytest.raises(InputError, match=says):
+            policy.act(observation)
+
+
+def test_the_return_is_estimated_with_reasons_against_it(folder: Path) -> None:
+    said = control("ope", folder / "run", folder / "store", "--discount", 0.8)[0]
+    # Torques drawn at random tell nothing of a policy that does not draw them.
+    assert "do not rely on the estimate: the policy's actions are far" in said
+    assert re.search(r"policy +-\d+.*\[-.*\nbehaviour +-\d+", said)
+    assert "discount is 1" in refused("ope", folder / "run", folder / "store", "--discount", 1)

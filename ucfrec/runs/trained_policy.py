@@ -97,7 +97,7 @@ class TrainedPolicy:
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
         weights, fitted = f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"
-        record.require(folder, ITEM_STATES, weights, fitted)  # however large
+        record.require(folder, ITEM_STATES, OFFERS, weights, fitted)  # however large
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))

@@ -17,9 +17,6 @@ ACTION: Final = "action"
 OBSERVATION: Final = "observation"
 """A list of floats: what was observed just before the action."""
 
-CANDIDATES: Final = "candidates"
-"""A list of item ids: what the item was chosen from. In a store, the number of that set."""
-
 # Columns of exposures, one row per item shown, besides those of logs.
 REQUEST_ID: Final = "request_id"
 POSITION: Final = "position"
@@ -50,7 +47,6 @@ STEP_DTYPES: Final = {
     TIMESTAMP: "<i8",
     PROPENSITY: "<f4",
     IS_RANDOM: "|u1",
-    CANDIDATES: "<i4",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 

@@ -1,7 +1,7 @@
-"""What was on offer: the items that a decision could show, by its time and its candidates."""
+"""What was on offer: the items that a decision could show at its time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,39 +14,27 @@ from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 
-def _no_rows(columns: int) -> Tensor:
-    return torch.zeros(columns, 0, dtype=torch.int64)
-
-
 @dataclass(frozen=True)
 class Offers:
-    """When items are available, and the sets of candidates that decisions chose from."""
+    """When the items of a catalogue are available."""
 
     begin: Tensor
     """(n_items,) int64 first ms of each item's first interval."""
     end: Tensor
     """(n_items,) int64 ms at which it is over."""
-    later: Tensor = field(default_factory=lambda: _no_rows(3))
+    later: Tensor
     """(3, R) int64 item, begin and end of further intervals, by item."""
-    sets: Tensor = field(default_factory=lambda: _no_rows(2))
-    """(2, C) int64 number of a set of candidates, from 0, and an item in it, ascending."""
 
     @classmethod
-    def of(cls, n_items: int, intervals: IntArray, sets: IntArray | None = None) -> "Offers":
-        """Items without an interval are always available.
-
-        Args:
-            intervals: (3, I) int64 item, begin and end, which is above the begin, in any order.
-            sets: (2, C) as the field; None for none.
-        """
+    def of(cls, n_items: int, intervals: IntArray) -> "Offers":
+        """From intervals (3, I) int64 of items, in any order, each with its begin and end, which is
+        later. Items without one are always available."""
         item, begin, end = intervals[:, np.lexsort((intervals[1], intervals[0]))]
         first = np.diff(item, prepend=-1) > 0
         bounds = [torch.full((n_items,), bound) for bound in ALWAYS]
         for values, bound in zip((begin, end), bounds, strict=True):
             bound[torch.from_numpy(item[first])] = torch.from_numpy(values[first])
-        later = torch.from_numpy(np.stack([item, begin, end])[:, ~first])
-        candidates = _no_rows(2) if sets is None else torch.from_numpy(sets)
-        return cls(bounds[0], bounds[1], later, candidates)
+        return cls(bounds[0], bounds[1], torch.from_numpy(np.stack([item, begin, end])[:, ~first]))
 
     @property
     def intervals(self) -> IntArray:
@@ -55,16 +43,15 @@ class Offers:
         first = torch.stack([bounded, self.begin[bounded], self.end[bounded]])
         return torch.cat([first, self.later], dim=1).numpy()
 
-    def at(self, times: Tensor, sets: Tensor | None = None) -> "Offer":
-        """What was on offer in M decisions: times (M,) int64 ms, and numbers (M,) of their sets of
-        candidates, −1 or None for all items."""
-        return Offer(self, times, sets)
+    def at(self, times: Tensor) -> "Offer":
+        """What was on offer in M decisions, at times (M,) int64 ms."""
+        return Offer(self, times)
 
     def count_unavailable(self, items: IntArray, times: IntArray) -> int:
         """How many of the items (N,) are not available at times (N,) ms; −1 is no item."""
-        listed = items >= 0
-        offer = self.at(torch.from_numpy(times[listed].astype(np.int64)))
-        has_item = offer.has(torch.from_numpy(items[listed].astype(np.int64)))
+        is_item = items >= 0
+        offer = self.at(torch.from_numpy(times[is_item].astype(np.int64)))
+        has_item = offer.has(torch.from_numpy(items[is_item].astype(np.int64)))
         return int((~has_item).sum())
 
     def save(self, path: Path) -> None:
@@ -79,17 +66,13 @@ class Offers:
         with damage_explained(path, REMEDY):
             offers = cls(**tensors)
             n_items = len(offers.begin) if n_items is None else n_items
-            shapes = {"begin": (n_items,), "end": (n_items,), "later": (3, None), "sets": (2, None)}
-            for name, (first, *_) in shapes.items():
-                tensor = tensors[name]
-                if tensor.dtype != torch.int64 or len(tensor) != first:
+            sizes = {"begin": n_items, "end": n_items, "later": 3}
+            for name, size in sizes.items():
+                if tensors[name].dtype != torch.int64 or len(tensors[name]) != size:
                     raise ValueError(f"{name} is not of {n_items} items")
-            for items in (offers.later[0], offers.sets[1]):
-                if items.numel() and not 0 <= int(items.min()) <= int(items.max()) < n_items:
-                    raise ValueError(f"it names items beyond the {n_items}")
-            keys = offers.sets[0] * n_items + offers.sets[1]
-            if bool((offers.later[0].diff() < 0).any()) or bool((keys.diff() <= 0).any()):
-                raise ValueError("its rows are not in order")
+            item = offers.later[0]
+            if bool((item.diff() < 0).any()) or bool(((item < 0) | (item >= n_items)).any()):
+                raise ValueError("its later intervals are not those of items in order")
             return offers
 
 
@@ -100,13 +83,10 @@ class Offer:
     offers: Offers
     times: Tensor
     """(M,) int64 ms."""
-    sets: Tensor | None = None
-    """(M,) int64 numbers of their sets of candidates, −1 for all items; None for no sets."""
 
     def change(self, change: Callable[[Tensor], Tensor]) -> "Offer":
-        """A copy of which times and sets are changed, as those of some decisions."""
-        sets = None if self.sets is None else change(self.sets)
-        return Offer(self.offers, change(self.times), sets)
+        """A copy of which the times are changed, as those of some decisions."""
+        return Offer(self.offers, change(self.times))
 
     def has(self, items: Tensor) -> Tensor:
         """(M,) bool, whether one item (M,) of each decision was on offer."""
@@ -117,10 +97,6 @@ class Offer:
         for place in range(int((last - first).max()) if len(items) else 0):
             at = (first + place).clamp(max=len(item) - 1)
             offered |= (first + place < last) & (begin[at] <= times) & (times < end[at])
-        if self.sets is not None:
-            size = len(offers.begin)
-            keys, members = self.sets * size + items, offers.sets[0] * size + offers.sets[1]
-            offered &= (self.sets < 0) | torch.isin(keys, members)
         return offered
 
     def mask(self, items: Tensor | None = None) -> Tensor:
@@ -138,28 +114,7 @@ class Offer:
             again = (begin[some] <= times) & (times < end[some])
             counts = offered.int().index_add_(1, columns[some], again.int())
             offered = counts > 0
-        if self.sets is not None and bool((self.sets >= 0).any()):
-            numbers, rows = torch.unique(self.sets, return_inverse=True)
-            offered &= self._members(numbers, items)[rows]
         return offered
-
-    def _members(self, numbers: Tensor, items: Tensor | None) -> Tensor:
-        """(S, L) bool, whether the sets (S,) hold the items (L,) or all; −1 holds every item."""
-        sets, size = self.offers.sets, len(self.offers.begin)
-        width = size if items is None else len(items)
-        members = (numbers < 0).unsqueeze(1).repeat(1, width)
-        first, last = (
-            torch.searchsorted(sets[0].contiguous(), numbers, right=r) for r in (False, True)
-        )
-        lengths = last - first
-        rows = torch.repeat_interleave(torch.arange(len(numbers)), lengths)
-        places = torch.arange(len(rows)) - (lengths.cumsum(0) - lengths - first)[rows]
-        columns = sets[1][places]
-        if items is not None:
-            columns = columns_of(columns, items)
-            rows, columns = rows[columns >= 0], columns[columns >= 0]
-        members[rows, columns] = True
-        return members
 
 
 def columns_of(items: Tensor, among: Tensor) -> Tensor:

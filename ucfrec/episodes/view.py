@@ -1,6 +1,5 @@
 """Columns of a store, memory-mapped or in memory, and views of its episodes."""
 
-import math
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import replace
@@ -29,8 +28,6 @@ _DTYPES: Final = {
     **schema.EPISODE_DTYPES,
 }
 _BATCH_STEPS = 2**20
-_OFFERED = 2**28
-"""Most pairs of a step and an item that `even_counts` looks at."""
 _LONG_ENOUGH = 1000
 """Mean number of steps from which consecutive steps are read as slices."""
 
@@ -136,7 +133,7 @@ class Columns:
 
     @cached_property
     def offers(self) -> Offers | None:
-        """When items are available, and sets of candidates; None where all is always on offer."""
+        """When items are available; None where all always are."""
         if not (self.path / OFFERS).is_file():
             return None
         self.record.require(self.path, OFFERS)
@@ -363,9 +360,8 @@ class EpisodeView:
         offers = self._columns.offers
         if offers is None:
             return None
-        names = [n for n in (schema.TIMESTAMP, schema.CANDIDATES) if n in self.record.columns]
-        values = [self.step_values(name, episodes, steps).astype(np.int64) for name in names]
-        return Offer(offers, *(torch.from_numpy(value) for value in values))
+        times = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+        return Offer(offers, torch.from_numpy(times))
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""
@@ -423,40 +419,6 @@ class EpisodeView:
         for (items,) in self.column_batches(schema.ITEM):
             counts += np.bincount(items, minlength=len(counts))
         return counts
-
-    def even_counts(self) -> Tensor | None:
-        """(n_items,) float32 expected `item_counts` of even draws from what was on offer, from some
-        of the steps if they are many; None without offers."""
-        counts, parts = torch.zeros(len(self.item_states.embeddings)), 0
-        for offer, _ in self._sample_offers():
-            if offer is None:
-                return None
-            offered = offer.mask().float()
-            counts += (offered / offered.sum(1, keepdim=True).clamp(min=1)).sum(0)
-            parts += len(offered)
-        return counts * (self.n_steps / max(1, parts))
-
-    def mean_loss(self, scores: Tensor) -> float:
-        """Mean −log softmax (nats), over what was on offer, of the scores (n_items,) of the items
-        shown, from some of the steps if they are many; NaN without steps."""
-        losses = []
-        for offer, items in self._sample_offers():
-            if offer is None:
-                items = torch.from_numpy(self.column(schema.ITEM)).long()
-                return -float(scores.log_softmax(0)[items].double().mean())
-            offered = offer.mask().scatter(1, items.unsqueeze(1), True)
-            logs = scores.masked_fill(~offered, -torch.inf).log_softmax(1)
-            losses.append(-logs.gather(1, items.unsqueeze(1)))
-        return float(torch.cat(losses).double().mean()) if losses else math.nan
-
-    def _sample_offers(self) -> Iterator[tuple[Offer | None, Tensor]]:
-        """What was on offer at evenly spaced steps, and the items shown, some at a time."""
-        n_items = len(self.item_states.embeddings)
-        numbers = np.arange(0, self.n_steps, -(-self.n_steps * n_items // _OFFERED) or 1)
-        for part in np.array_split(numbers, -(-len(numbers) * n_items // _BATCH_STEPS) or 1):
-            episodes, steps = self.locate(part)
-            items = self.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-            yield self.offer(episodes, steps), torch.from_numpy(items)
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""

@@ -185,14 +185,12 @@ def _read_part(
     columns = (column for source in sources for column in source.columns)
     narrow = opened.of(columns, raw)
     available = tuple(
-        _cast_time(connection, narrow, name, times[name]) if name in times else "NULL::BIGINT"
+        cast_value(connection, narrow, schema.TIMESTAMP, name, times[name], None)[0]
+        if name in times
+        else "NULL::BIGINT"
         for name in (_TIMES if times else ())
     )
     return _Part(narrow, key, first_by, features, available)
-
-
-def _cast_time(connection: duckdb.DuckDBPyConnection, table: Table, name: str, time: Bound) -> str:
-    return cast_value(connection, table, schema.TIMESTAMP, name, time, None)[0]
 
 
 def _bind_times(

@@ -57,8 +57,9 @@ _MEANINGS: Final = {
 }
 _NOTES: Final = (
     "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
-    "and tag_run; put items that are not available into `excluded`, with exclude_seen the session's "
-    "items, too; with a temperature, draw from `scores` divided by it, with top_k among so many best; with explore, draw that "
+    "and tag_run; put into `excluded` what is not available and, with exclude_seen, the session's "
+    "items; with a temperature, draw from `scores` divided by it, with top_k among so many best; "
+    "with explore, draw that "
     "share of the requests uniformly, with explore_top among so many best"
 )
 _SERVE: Final = "use `ucfrec serve` or `recommend --stream`"

@@ -15,7 +15,6 @@ from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import (
     SHOWN,
     LoggedEvidence,
-    _Candidate,
     _choose_best,
     choose_by_ranking,
 )
@@ -105,15 +104,13 @@ def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -
 
 
 def test_of_rules_of_the_highest_rate_the_one_with_the_most_hits_is_chosen() -> None:
-    rows = np.arange(40)
-
-    def candidate(weight: float, rate: float, hits: np.ndarray) -> _Candidate:
-        rule, liked = DecisionRule(1.0, reward_weight=weight), np.ones(40, dtype=bool)
-        return _Candidate(rule, rows, np.full(40, rate), liked, hits, hits.astype(np.float64))
-
-    few, many = candidate(0.0, 0.5, rows % 4 == 0), candidate(1.0, 0.5, rows % 2 == 0)
-    poor = candidate(2.0, 0.1, rows >= 0)
-    assert _choose_best([few, many, poor]) is _choose_best([poor, many, few]) is many
+    few, many, poor = (
+        RankedRule(DecisionRule(1.0, reward_weight=weight), rate, hits, hits, 0.1)
+        for weight, rate, hits in ((0.0, 0.5, 0.25), (1.0, 0.5, 0.5), (2.0, 0.1, 1.0))
+    )
+    rates = {rule: np.full(40, rule.item_rate) for rule in (few, many, poor)}
+    backwards = dict(reversed(rates.items()))
+    assert _choose_best(rates, np.arange(40)) is _choose_best(backwards, np.arange(40)) is many
 
 
 RULE = ["rule.sessions=20", "rule.least_items=2.0", "rule.least_impressions=1"]

@@ -268,7 +268,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert not model.affinity.any()
     assert not model.user.any()
     users = users_of(tmp_path / "run", store)
-    assert users.training_users.report.calibration == users.calibration
+    assert users.training_users[1].calibration == users.calibration
     # The chosen rule was simulated again in four times the sessions.
     more = search_of(trained, replace(config.rule, sessions=60))
     (simulated,) = more.simulate([trained.rule])

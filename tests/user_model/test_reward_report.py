@@ -19,8 +19,6 @@ from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.runs.run import training_views
 from ucfrec.user_model.reward import LAGS, ItemRewardModel
 from ucfrec.user_model.reward_fit import (
-    TrainingUsers,
-    draw_sessions,
     fit_item_reward_model,
     fit_training_users,
     reward_model_sizes,
@@ -70,10 +68,10 @@ def store_of(
     return EpisodeStore.from_arrays(columns, np.full(USERS, LENGTH), episodes, states)
 
 
-def chances(users: TrainingUsers, rows: RewardRows) -> Float64Array:
+def chances(users: Any, rows: RewardRows) -> Float64Array:
     """(M,) the calibrated chances that users like what is shown in the rows."""
-    slope, intercept = users.report.calibration
-    scores = users.model.score(rows.states, rows.history, rows.users, rows.items)
+    slope, intercept = users[1].calibration
+    scores = users[0].score(rows.states, rows.history, rows.users, rows.items)
     return torch.sigmoid(slope * scores + intercept).double().numpy()
 
 
@@ -83,7 +81,7 @@ def test_tastes_are_found(tmp_path: Path) -> None:
     rows = RewardRows.at(train, *train.all_steps(), LAGS)
     liked = rows.items.numpy() % KINDS == kind[rows.users.numpy()]
     found = chances(users, rows)
-    assert "affinity" in {tried.effect for tried in users.report.effects if tried.kept}
+    assert "affinity" in {tried.effect for tried in users[1].effects if tried.kept}
     assert found[liked].mean() == pytest.approx(LIKED, abs=0.15)
     assert found[~liked].mean() == pytest.approx(OTHER, abs=0.05)
 
@@ -94,7 +92,7 @@ def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> 
     first = rows.items.numpy() < HALF
     users = fit_training_users(log_of_moods(0.7), tmp_path / "weighted", seed=0)
     crude = fit_training_users(log_of_moods(0.7, told=False), tmp_path / "crude", seed=0)
-    assert (users.report.weighted, crude.report.weighted) == (True, False)
+    assert (users[1].weighted, crude[1].weighted) == (True, False)
     found, without = chances(users, rows), chances(crude, rows)
     assert without[first].mean() - without[~first].mean() > 0.3
     assert abs(found[first].mean() - found[~first].mean()) < 0.1
@@ -111,17 +109,17 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
     assert found[seen.ravel()].mean() == pytest.approx(LIKED, abs=0.03)
     assert found[~seen.ravel()].mean() == pytest.approx(OTHER, abs=0.03)
     states, nothing = torch.randn(3, train.state_size), torch.zeros(3, KINDS + 1)
-    level = users.model.level(states, None, nothing)
+    level = users[0].level(states, None, nothing)
     states[:, : train.item_states.size] += 1
-    assert torch.equal(level, users.model.level(states, None, nothing))
+    assert torch.equal(level, users[0].level(states, None, nothing))
 
 
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     train, file = log_of_tastes()[0], tmp_path / "training_users.safetensors"
     users = fit_training_users(train, tmp_path, seed=0)
-    report = dataclasses.asdict(users.report)
+    report = dataclasses.asdict(users[1])
     for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
-        save_tensors(file, users.model.state_dict(), other)
+        save_tensors(file, users[0].state_dict(), other)
         with pytest.raises(InputError, match="damaged"):
             fit_training_users(train, tmp_path, seed=0)
 
@@ -151,13 +149,6 @@ def test_weights_add_up_to_a_users_effective_number_of_steps(
     columns["propensity"] = np.where(np.arange(8) == 3, np.nan, logged)
     view = EpisodeStore.from_arrays(columns, np.array([3, 4, 1]), {"user": users}, states)
     assert weigh_by_propensity(view, *view.all_steps(), items) is None
-
-
-def test_sessions_are_drawn_by_the_seed() -> None:
-    train, _ = log_of_tastes()
-    first, again, other = (draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1))
-    assert [*first] == [*again] != [*other]
-    assert sorted(first) == sorted(train.episode_values("user"))
 
 
 MANY_USERS, FEW_STEPS = 300, 20

@@ -5,9 +5,8 @@ the ten items that it would show, and overlaps with the log enough if it finds l
 than the ten most liked ones do, by a standard error.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -141,14 +140,14 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     most = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS))
     episodes, steps = draw_steps(validation, most, problem.seed)
     logged = LoggedScores(scorer, validation, episodes, steps)
-    users, candidates = number_users(validation)[episodes], list[_Candidate]()
+    users, ranked = number_users(validation)[episodes], dict[RankedRule, Float64Array]()
     most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, n_items)).indices.numpy()
-    baseline = np.isin(logged.items, most_liked)
+    baseline, n_liked = np.isin(logged.items, most_liked), max(1, int(logged.liked.sum()))
     counts = TrainingCounts.of(validation)
     impressions, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
     rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
 
-    def rank(weights: Sequence[float]) -> _Candidate:
+    def rank(weights: Sequence[float]) -> RankedRule:
         rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
         tops = list[list[Tensor]]()
         for _, batch in logged.score(rules):
@@ -156,17 +155,25 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         for rule, *parts in zip(rules, *tops, strict=True):
             top = torch.cat(parts).numpy()
             hits = (top == logged.items[:, None]).any(1)
+            # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.
             ahead = (hits.astype(np.float64) - baseline) * logged.liked
-            mean_rates = rates[top].mean(1)
-            candidates.append(_Candidate(rule, users, mean_rates, logged.liked, hits, ahead))
-        return _choose_best(candidates)
+            gain, own_rates = float(ahead.sum()) / n_liked, rates[top].mean(1)
+            summary = RankedRule(
+                rule=rule,
+                item_rate=float(own_rates.mean()),
+                hits=float(hits[logged.liked].sum()) / n_liked,
+                gain=gain,
+                gain_error=_error_of_sum(ahead - gain * logged.liked, users) / n_liked,
+            )
+            ranked[summary] = own_rates
+        return _choose_best(ranked, users)
 
     best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
-        ranked = {each.rule.reward_weight: each for each in candidates}
-        nearest = min((each for each in ranked if each > weight), default=weight)
-        if ranked[nearest].overlaps:
+        of_weights = {each.rule.reward_weight: each for each in ranked}
+        nearest = min((each for each in of_weights if each > weight), default=weight)
+        if of_weights[nearest].overlaps:
             break
         best = rank([(weight + nearest) / 2])
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
@@ -175,60 +182,27 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
         "liked items better than the ten most liked ones do, by a standard error; no propensities "
         "are used",
-        tried=len(candidates),
+        tried=len(ranked),
         warning="" if best.overlaps else warning,
     )
-    return chosen, [candidate.summary for candidate in candidates]
+    return chosen, [*ranked]
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    """A rule, and what it would have shown in M rows."""
-
-    rule: DecisionRule
-    users: IntArray
-    rates: Float64Array
-    """(M,) mean rate, in the period, of the items shown."""
-    liked: BoolArray
-    hits: BoolArray
-    """(M,) whether the row's item is among those shown."""
-    ahead: Float64Array
-    """(M,) 1 for a liked item that only the rule shows, −1 for one that only the baseline does."""
-
-    @cached_property
-    def summary(self) -> RankedRule:
-        count = max(1, int(self.liked.sum()))
-        gain = float(self.ahead.sum()) / count
-        return RankedRule(
-            rule=self.rule,
-            item_rate=float(self.rates.mean()),
-            hits=float(self.hits[self.liked].sum()) / count,
-            gain=gain,
-            gain_error=self._error_of_sum(self.ahead - gain * self.liked) / count,
-        )
-
-    @property
-    def overlaps(self) -> bool:
-        """Whether it finds liked items better than the baseline."""
-        return self.summary.gain >= self.summary.gain_error
-
-    def levels_with(self, top: "_Candidate") -> bool:
-        """Whether the rate is not below that of another rule by more than a standard error."""
-        below = top.rates - self.rates
-        return bool(below.sum() <= self._error_of_sum(below - below.mean()))
-
-    def _error_of_sum(self, values: Float64Array) -> float:
-        """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""
-        return float(np.sqrt(np.square(np.bincount(self.users, values)).sum()))
-
-
-def _choose_best(candidates: Sequence[_Candidate]) -> _Candidate:
-    """The rule to choose; if none overlaps enough, of those that hit as often as any."""
-    allowed = [candidate for candidate in candidates if candidate.overlaps]
+def _choose_best(ranked: Mapping[RankedRule, Float64Array], users: IntArray) -> RankedRule:
+    """The rule to choose, of rules with the mean rate (M,) of the items that they show; if none
+    overlaps enough, of those that hit as often as any."""
+    allowed = [rule for rule in ranked if rule.overlaps]
     if not allowed:
-        most = max((candidate.summary for candidate in candidates), key=lambda rule: rule.gain)
-        enough = most.gain - most.gain_error
-        allowed = [candidate for candidate in candidates if candidate.summary.gain >= enough]
-    top = max(allowed, key=lambda candidate: candidate.summary.item_rate)
-    level = [candidate for candidate in allowed if candidate.levels_with(top)]
-    return max(level, key=lambda candidate: candidate.summary.hits)
+        most = max(ranked, key=lambda rule: rule.gain)
+        allowed = [rule for rule in ranked if rule.gain >= most.gain - most.gain_error]
+    top, level = max(allowed, key=lambda rule: rule.item_rate), list[RankedRule]()
+    for rule in allowed:
+        below = ranked[top] - ranked[rule]
+        if below.sum() <= _error_of_sum(below - below.mean(), users):
+            level.append(rule)
+    return max(level, key=lambda rule: rule.hits)
+
+
+def _error_of_sum(values: Float64Array, users: IntArray) -> float:
+    """Standard error of the sum of values (M,) of mean 0, whose rows depend within users (M,)."""
+    return float(np.sqrt(np.square(np.bincount(users, values)).sum()))

@@ -70,8 +70,7 @@ class Outcomes(NamedTuple):
     """(M,), all that were shown."""
 
     def append(self, more: "Outcomes") -> "Outcomes":
-        pairs = zip(self, more, strict=True)
-        return Outcomes._make(np.concatenate(pair) for pair in pairs)
+        return Outcomes._make(map(np.concatenate, zip(self, more, strict=True)))
 
 
 class _ManyRules(PolicyActor):
@@ -283,11 +282,9 @@ class RuleSearch:
             return self._find_start(candidates) or [max(candidates, key=attrgetter("items"))]
         top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
-
-        def is_level(item: SimulatedRule) -> bool:
-            return top.value - item.value <= max(least, self._error(top, item))
-
-        return [*filter(is_level, allowed)]
+        return [
+            item for item in allowed if top.value - item.value <= max(least, self._error(top, item))
+        ]
 
     def _find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         return [candidate for candidate in candidates if candidate.rule == self.problem.start]
@@ -357,7 +354,7 @@ class RuleSearch:
             doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
         if report is not None and abs(report.optimism) > max(_FAR_OFF, report.optimism_error):
             doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
-        weighted = training is not None and training.report.weighted
+        weighted = training is not None and training[1].weighted
         if not (weighted if report is None else report.weighted):
             some = schema.PROPENSITY in self.problem.train.record.columns
             lack = "some rows of the log have" if some else "the log has"
@@ -431,21 +428,17 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
         windows = [window for window in config.tag_windows if 0 < window <= longest]
         # At all temperatures: at a low one, the log may support what the policy shows only once
         # some items are excluded.
-        rules = search.simulate(_vary(second, temperature=temperatures, tag_window=windows))
-        candidates += rules
-        if rules:
+        if rules := search.simulate(_vary(second, temperature=temperatures, tag_window=windows)):
             best = search.best(rules).rule
             weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
             more = _vary(best, tag_window=sorted({*windows}), reward_weight=weights)
-            candidates += search.simulate(more)
+            candidates += rules + search.simulate(more)
         # Without a tag window, which may only have served to cause no fatigue.
         runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
-        rules = search.simulate(_vary(second, tag_run=runs))
-        candidates += rules
-        if rules:
+        if rules := search.simulate(_vary(second, tag_run=runs)):
             best = search.best(rules).rule
             more = _vary(best, temperature=temperatures, reward_weight=config.reward_weights)
-            candidates += search.simulate(more)
+            candidates += rules + search.simulate(more)
     if search.least_users:
         done = {candidate.rule for candidate in candidates}
         near = [rule for grid in _NEAR_THE_LOG for rule in _vary(first, **grid)]

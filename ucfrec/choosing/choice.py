@@ -160,6 +160,11 @@ class RankedRule:
     """Difference of `hits` from that of the most liked training items."""
     gain_error: float
 
+    @property
+    def overlaps(self) -> bool:
+        """Whether it finds liked items better than these."""
+        return self.gain >= self.gain_error
+
 
 class RuleRecord(Entry):
     """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""

@@ -400,11 +400,14 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
             f"{indent}It ranked best of {choice.tried} rules in the validation period.",
             f"{indent}Selected by the {choice.chosen_by}{choice.warning}",
         ]
+    first, second = estimate.halves
     lines += [
         f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
         "simulated users, it has the best return",
         f"{indent}(or one level with it) that the log supports: {estimate.value:.4g} ± "
         f"{estimate.error:.2g} per session, estimated; logged sessions have {logged:.4g}.",
+        f"{indent}Halves of the users: {first:.4g} and {second:.4g}; "
+        f"{sum(choice.halves_agree or ())} of 2 choose this rule.",
         *(f"{indent}WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts),
     ]
     lines[-1] += choice.warning.replace("; WARNING", f"\n{indent}WARNING")

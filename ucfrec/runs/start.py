@@ -34,7 +34,7 @@ from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, read_record, ref
 from ucfrec.runs.trained_policy import COUNTS, ITEMS, RETURNS, RULE, USERS, TrainedPolicy
 from ucfrec.user_model.reward_fit import reward_model_sizes
 
-SHARE: Final = 1 / 16
+_SHARE: Final = 1 / 16
 """Steps of a warm training, as a share of those of one from scratch."""
 _MOST_RETURNS: Final = 1_000_001
 _QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
@@ -285,11 +285,11 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
     return replace(rule, lookahead=rule.lookahead * reward / old_reward if old_reward > 0 else 0.0)
 
 
-def warm_settings(config: Config, share: float = SHARE) -> Config:
-    """The settings of a warm training, of a `share` of the steps and epochs of one from scratch."""
-    steps = max(1, round(share * config.train.steps))
+def warm_settings(config: Config) -> Config:
+    """The settings of a warm training, of `_SHARE` of the steps and epochs of one from scratch."""
+    steps = max(1, round(_SHARE * config.train.steps))
     warmup = min(config.train.warmup_steps, steps // 10)
     every = min(config.train.validate_every, steps)
     train = replace(config.train, steps=steps, warmup_steps=warmup, validate_every=every)
-    epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
+    epochs = max(1, round(_SHARE * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

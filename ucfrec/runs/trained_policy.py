@@ -213,31 +213,14 @@ class TrainedPolicy:
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
     def scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """The policy under `rule`, by default the run's own; InputError if it does not fit.
+        """The policy under `rule`, by default the run's own; InputError if it does not fit. The
+        weights must not change after the first call."""
+        return self._scorer.under(rule or self.rule)
 
-        What it computes once is kept for the next call with the same weights.
-        """
-        rule, models = rule or self.rule, (self.policy, self.reward_model)
-        weights = [
-            (id(tensor), tensor.data_ptr(), tensor._version)
-            for model in models
-            if model is not None
-            for tensor in model.state_dict(keep_vars=True).values()
-        ]
-        if self._kept.get("weights") != weights:
-            # The one before goes first, for its memory.
-            self._kept.clear()
-            self._kept["weights"] = weights
-            self._kept["scorer"] = Scorer(
-                self.policy,
-                rule,
-                self.item_states,
-                self.record.return_to_go,
-                self.reward_model,
-                self.session_end,
-            )
-        cached: Scorer = self._kept["scorer"]
-        return cached.under(rule)
+    @cached_property
+    def _scorer(self) -> Scorer:
+        record, models = self.record, (self.reward_model, self.session_end)
+        return Scorer(self.policy, self.rule, self.item_states, record.return_to_go, *models)
 
     def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
         """`scorer` of a policy of items; an `InputError` if its actions are vectors."""
@@ -246,10 +229,6 @@ class TrainedPolicy:
                 "this policy's actions are vectors; recommending needs a policy trained on items"
             )
         return self.scorer(rule)
-
-    @cached_property
-    def _kept(self) -> dict[str, Any]:
-        return {}
 
     def actor(
         self,

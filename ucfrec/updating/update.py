@@ -4,7 +4,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -20,14 +19,9 @@ from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import drop_columns
-from ucfrec.runs.start import SHARE, warm_settings
+from ucfrec.runs.start import warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, measure_drift
-
-_COUNTS: Final = (
-    *("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps"),
-    "expired_steps",
-)
 
 
 @dataclass(frozen=True)
@@ -36,8 +30,6 @@ class UpdateOptions:
 
     append: AppendOptions = field(default_factory=AppendOptions)
     """How the store grows."""
-    share: float = SHARE
-    """Steps of the training, as a share of those of a training from scratch."""
     seed: int | None = None
     """Of everything random; None for that of the run."""
     refit: bool = True
@@ -101,14 +93,14 @@ def update_run(
         # In place of the settings of the rule's choice, it has the rule.
         settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
-    config, seed = warm_settings(full, options.share), options.seed
+    config, seed = warm_settings(full), options.seed
     config = replace(config, seed=config.seed if seed is None else seed)
     update = Update(
         of=run.resolve().name,
         run=trained.fingerprint,
         settings_from_nothing=asdict(full),
         episodes=counts["episodes"],
-        appended={name: counts[name] for name in _COUNTS}
+        appended={name: count for name, count in counts.items() if type(count) is int}
         | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
     entries = {"update": update, "dropped_observations": trained.record.dropped_observations}

@@ -206,9 +206,8 @@ def measure_drift(
     assert old.counts is not None
     times_shown = old.counts.shown.numpy()
     times_shown_now = np.bincount(items[items >= 0], None, len(times_shown))
-    rows = np.sort(np.random.default_rng(seed).integers(training.n_steps, size=_MOST_STEPS))
-    episodes, steps = training.locate(rows)
-    rewards = training.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+    drawn = draw_steps(training, _MOST_STEPS, seed)
+    rewards = training.step_values(schema.REWARD, *drawn).astype(np.float64)
     measures = {
         "unknown_items": counts["new_item_steps"] / max(counts["steps"], 1),
         "unknown_users": counts["new_user_steps"] / max(counts["steps"], 1),

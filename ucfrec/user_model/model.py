@@ -18,7 +18,11 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import TrainingUsers, fit_item_reward_model, fit_training_users
+from ucfrec.user_model.reward_fit import (
+    TrainingUsersReport,
+    fit_item_reward_model,
+    fit_training_users,
+)
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
 from ucfrec.user_model.session_end import (
     SESSIONS,
@@ -45,7 +49,7 @@ class UserModel:
     reward: ItemRewardModel
     """Expected reward of every item, as acting knows it."""
     reward_report: ItemRewardReport
-    training_users: TrainingUsers | None
+    training_users: tuple[ItemRewardModel, TrainingUsersReport] | None
     """Who reward what simulated sessions show; None where no sessions are simulated."""
     calibration: tuple[float, float]
     """Slope and intercept of the scores that rewards are drawn from, on held-out rows."""
@@ -81,17 +85,17 @@ class UserModel:
         if not path.exists():
             fatigue = calibration = None
             if reward.binary:
-                first_runs = LoggedRuns.of(train, tags, reward.lags, _MOST_STEPS)
-                later_runs = LoggedRuns.of(validation, tags, reward.lags, _MOST_STEPS)
-                fatigue = fit_fatigue(first_runs, later_runs)
+                views, lags = (train, validation), reward.lags
+                fatigue = fit_fatigue(*(LoggedRuns.of(v, tags, lags, _MOST_STEPS) for v in views))
             logged, held_out = (
                 LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line = users.report.calibration if users else (1.0, 0.0)
-            if users is None or not report.new_users:
-                model = users.model if users else reward
+            if users is not None and report.new_users:
+                line = users[1].calibration
+            else:
+                model = users[0] if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
             fitted: dict[str, Any] = {
@@ -120,7 +124,7 @@ class UserModel:
     @property
     def rewarding(self) -> ItemRewardModel:
         """The model that rewards of simulated sessions are drawn from."""
-        return self.reward if self.training_users is None else self.training_users.model
+        return self.reward if self.training_users is None else self.training_users[0]
 
     def expect(
         self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor

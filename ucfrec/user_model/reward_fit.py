@@ -6,7 +6,6 @@ log has all propensities, rows of new users are weighted, as policies that knew 
 shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -58,14 +57,6 @@ class TrainingUsersReport:
     """The effects that were tried, evaluated on these rows."""
     weighted: bool
     """Whether the effects are fitted to rows weighted by propensities."""
-
-
-@dataclass(frozen=True)
-class TrainingUsers:
-    """Rewards of items for training users, and how their tastes were found."""
-
-    model: ItemRewardModel
-    report: TrainingUsersReport
 
 
 def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -155,7 +146,6 @@ def refit_item_reward_model(
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
-    search.kept = dict(begin.spreads)
     if report.new_users:
         search.kept = {name: begin.spreads[name] for name in LASTING if name in begin.spreads}
         search.fit_to(design)
@@ -163,7 +153,7 @@ def refit_item_reward_model(
         if "tastes" in begin.spreads:
             search.sessions = model, rows.history, rows.history
             search.set_tastes(tensors["tastes.root"])
-        search.kept = dict(begin.spreads)
+    search.kept = begin.spreads
     search.fit_to(search.design)
     model.set_effects(search.effects, search.design.sum_content)
     save_fit(folder / FITTED, model, search.effects, report)
@@ -172,13 +162,13 @@ def refit_item_reward_model(
 
 def fit_training_users(
     train: EpisodeStore, folder: Path, seed: int, weighted: bool = True, first: Path | None = None
-) -> TrainingUsers:
+) -> tuple[ItemRewardModel, TrainingUsersReport]:
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
     if (metadata := _read_fit(file, model)) is not None:
         with damage_explained(file, REMEDY):
-            return TrainingUsers(model, TrainingUsersReport(**metadata))
+            return model, TrainingUsersReport(**metadata)
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
@@ -202,7 +192,7 @@ def fit_training_users(
     report = TrainingUsersReport(line, search.report(), weights is not None)
     model.set_effects(search.effects, search.design.sum_content)
     save_fit(file, model, search.effects, report)
-    return TrainingUsers(model, report)
+    return model, report
 
 
 def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:

@@ -279,7 +279,9 @@ class Scorer:
                     without |= excluded
                 if sessions.offer is not None:
                     without |= ~sessions.offer.mask()
-                return _require_scores(self._engine(sessions, without), empty)
+                scores = self._engine(sessions, without)
+                scores = scores + self.rule.reward_weight * self._sum_running(sessions)
+                return _require_scores(scores, empty)
             return self.scores_of(self.query(sessions), left_out, excluded, empty=empty)
 
     @torch.no_grad()
@@ -296,6 +298,8 @@ class Scorer:
             weight = self.rule.reward_weight
             model = query.model if weight else None
             scores = self._items.scores(query.items, query.policy, model, weight, query.outputs)
+            if model is not None and query.sessions.offer is not None:
+                scores = scores + weight * self._sum_running(query.sessions)
         else:
             scores = self._compose(query)
         exporting = torch.compiler.is_exporting()
@@ -319,7 +323,13 @@ class Scorer:
         """f̂_r (B, n_items), in the reward model's units, up to a constant per row."""
         states = sessions.windows(self.states, 1).states[:, -1]
         part = self._items.model_part(sessions, states)
-        return self._items.scores(self._items.pad_items(sessions.shown), None, part, 1.0)
+        scores = self._items.scores(self._items.pad_items(sessions.shown), None, part, 1.0)
+        return scores + self._sum_running(sessions)
+
+    def _sum_running(self, sessions: Sessions) -> Tensor:
+        """(B, n_items) what running rates and ages add to f̂_r; 0 without."""
+        model = self.reward_model
+        return torch.zeros(()) if model is None else model.sum_running(sessions.offer)
 
     @torch.inference_mode()
     def scores_of_some(
@@ -336,6 +346,11 @@ class Scorer:
         rewards = bool(self.rule.reward_weight)
         scores = products + self._items.addends(query.items, part, candidates, rewards)
         if query.sessions.offer is not None:
+            if rewards:
+                running = self._sum_running(query.sessions).expand(
+                    len(candidates), self._items.count
+                )
+                scores = scores + self.rule.reward_weight * running.gather(1, candidates)
             offered = query.sessions.offer.mask().gather(1, candidates)
             scores = scores.masked_fill(~offered, -torch.inf)
         for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
@@ -350,6 +365,7 @@ class Scorer:
             scores = rule.policy_weight * of_policy
         if query.model is not None and rule.reward_weight:
             odds = self._items.scores(items, None, query.model, 1.0)
+            odds = odds + self._sum_running(query.sessions)
             if rule.looks_ahead:
                 return self._add_lookahead(scores, odds, query)
             scores = scores + rule.reward_weight * odds

@@ -138,7 +138,7 @@ class RuleSearch:
         self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
         counts = train.item_counts()
-        if problem.validation.whole.offer(np.zeros(1, int), np.zeros(1, int)) is not None:
+        if problem.validation.has_offers:
             # What is new in the validation sessions is not in the training ones.
             counts = counts + problem.validation.item_counts()
         self._supported = counts >= self._config.least_impressions

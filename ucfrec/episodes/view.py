@@ -355,6 +355,11 @@ class EpisodeView:
         index = self._columns.starts[self.episode_ids[episodes]] + steps
         return self._columns.step_column(name).take(index)
 
+    @property
+    def has_offers(self) -> bool:
+        """Whether items come and go; otherwise all are always on offer."""
+        return self._columns.offers is not None
+
     def offer(self, episodes: IntArray, steps: IntArray) -> Offer | None:
         """What was on offer at steps of episodes, as `step_values`; None for everything."""
         offers = self._columns.offers

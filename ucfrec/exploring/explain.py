@@ -79,7 +79,8 @@ def explain(
     numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)
     sessions = sessions_of(trained, latest, trained.scorer().length)
-    parts = _parts(trained.scorer(rule), sessions)
+    offer = None if trained.offers is None else trained.offers.at(torch.tensor([at]))
+    parts = _parts(trained.scorer(rule), replace(sessions, offer=offer))
     numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
     cards = []
     for number, row in zip(numbers, frame.to_dict("records"), strict=True):
@@ -141,7 +142,8 @@ def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
         unexposed = alone.scores_of(query, empty=True)[0].double()
     rewarded = scores(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
     sums = (torch.zeros_like(exposed), unexposed, exposed, rewarded, scores())
-    parts = [after - before for before, after in pairwise(sums)]
+    # Scores of what is not available are −∞.
+    parts = [(after - before).nan_to_num(nan=0.0, neginf=0.0) for before, after in pairwise(sums)]
     return {name: part - part.mean() for name, part in zip(PARTS, parts, strict=True)}
 
 

@@ -24,6 +24,7 @@ from ucfrec.user_model.reward_fit import (
     fit_training_users,
 )
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
+from ucfrec.user_model.running import RunningRates
 from ucfrec.user_model.session_end import (
     SESSIONS,
     LoggedEnds,
@@ -105,6 +106,8 @@ class UserModel:
                 "fatigue": fatigue and asdict(fatigue),
             }
             save_tensors(path, dict(end.tensors), fitted)
+        for model in (reward, *([users[0]] if users else [])):
+            model.rates = RunningRates.of(train, model.target)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
@@ -127,11 +130,16 @@ class UserModel:
         return self.reward if self.training_users is None else self.training_users[0]
 
     def expect(
-        self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
+        self,
+        states: Tensor,
+        history: Shown,
+        users: Tensor | None,
+        items: Tensor,
+        offer: Offer | None = None,
     ) -> Float64Array:
         """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
         slope, intercept = self.calibration
-        scores = self.rewarding.score(states, history, users, items)
+        scores = self.rewarding.score(states, history, users, items, offer)
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
         if self.fatigue is None:
             return rewards
@@ -227,7 +235,7 @@ class UserSimulator:
         states = self._sessions.latest_states(self._store.item_states, observations)
         history, users = self._sessions.shown.latest(self._lags), self._sessions.users
         steps = self._sessions.steps.numpy()
-        expected = self._model.expect(states, history, users, items)
+        expected = self._model.expect(states, history, users, items, self.offer)
         rewards = self._logged.draw(expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
         self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))

@@ -19,7 +19,7 @@ from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_o
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
 EFFECTS: Final = (
-    *("item", "user", "content", "affinity", "tastes", "exposure"),
+    *("running", "item", "user", "content", "affinity", "tastes", "exposure"),
     *("context", "state", "interaction"),
 )
 """In the order in which they are added to the model."""
@@ -42,9 +42,9 @@ _LEAST_KNOWN: Final = 0.1
 """Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
-LASTING: Final = ("item", "user", "content", "affinity")
+LASTING: Final = ("running", "item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
-_ITEMS: Final = ("item", "content")
+_ITEMS: Final = ("running", "item", "content")
 """Effects of items alone."""
 _ROWS: Final = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
@@ -79,6 +79,8 @@ class Design:
     binary: bool
     weights: Tensor
     """(M,) how many rows each row counts for."""
+    running: Tensor
+    """(M, R) inputs of `RunningRates`; R is 0 where items are always available."""
     tastes: Tensor
     """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
@@ -109,6 +111,9 @@ class Design:
             n_users=last,
             binary=bool(model.binary),
             weights=torch.ones(len(rows)) if weights is None else weights,
+            running=torch.zeros(len(rows), 0)
+            if rows.offer is None or model.rates is None
+            else model.rates.inputs(rows.offer, rows.items),
             tastes=torch.zeros(len(rows)),
         )
 
@@ -133,6 +138,7 @@ class Design:
             "content": (self.n_tags + dim,),
             "affinity": (self.n_users + 1, dim),
             "exposure": (self.exposure.shape[1],),
+            "running": (self.running.shape[1],),
             "state": (state,),
             "interaction": (state, dim),
             "context": (self.observed.shape[1], dim),
@@ -147,6 +153,7 @@ class Design:
             "user": lambda numbers: numbers[self.users],
             "tastes": lambda number: self.tastes * number,
             "exposure": self.exposure.matmul,
+            "running": self.running.matmul,
             "state": self.x.matmul,
             "affinity": lambda rows: (F.embedding(self.users, rows) * self.rows).sum(1),
             "interaction": lambda matrix: ((self.x @ matrix) * self.rows).sum(1),
@@ -183,13 +190,14 @@ class Design:
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
-            case "exposure" | "state":
+            case "exposure" | "state" | "running":
                 return (weight * self.inputs(name).square()).sum(0)
         return self.inputs(name).square().T @ vectors
 
     def inputs(self, name: str) -> Tensor:
         """The inputs (M, …) that the effect `name` multiplies, the same for all items of a row."""
-        return {"exposure": self.exposure, "context": self.observed}.get(name, self.x)
+        shared = {"exposure": self.exposure, "running": self.running, "context": self.observed}
+        return shared.get(name, self.x)
 
     @property
     def count(self) -> float:
@@ -292,7 +300,7 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
 
 def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
     """Maps of an effect to units in which the objective is about evenly curved, and back."""
-    if name in ("state", "exposure"):
+    if name in ("state", "exposure", "running"):
         factor, inverse = _factors(curvature * _moments(design, design.inputs(name)), penalty)
         return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):

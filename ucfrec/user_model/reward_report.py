@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.reward import ItemRewardModel
@@ -43,6 +45,8 @@ class RewardRows:
     """(M,) float32, in reward units."""
     observations: int
     """O, the last numbers of the states: what was observed beside the session itself."""
+    offer: Offer | None = None
+    """What was on offer; None for everything."""
 
     def __len__(self) -> int:
         return len(self.items)
@@ -74,6 +78,7 @@ class RewardRows:
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
+            view.offer(episodes, steps),
         )
 
 
@@ -169,7 +174,8 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         states, users, history = rows.states[part], rows.users[part], rows.history.at(part)
-        scores.append(model.score(states, history, users, rows.items[part]))
+        offer = rows.offer and rows.offer.change(itemgetter(part))
+        scores.append(model.score(states, history, users, rows.items[part], offer))
     return torch.cat(scores)
 
 

@@ -93,6 +93,12 @@ def export(
     """
     _require_installed()
     graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
+    model = graph.scorer.reward_model
+    if graph.scorer.rule.reward_weight and model is not None and model.running.any():
+        raise InputError(
+            f"{trained.folder}: scores depend on the time of the request, as items come and go; "
+            f"{_SERVE}, or export a rule with reward weight 0"
+        )
     example = _draw_arguments(graph.scorer, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: list[dict[int, Any]] = [{0: batch} for _ in example]

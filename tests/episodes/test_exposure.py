@@ -79,7 +79,7 @@ def alike(states: ItemStates, one: int, other: int) -> float:
 def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
     """The terms added to all logits, one at a time."""
     added = torch.zeros(len(shown.items), ITEMS, dtype=torch.float64)
-    given = (values.tolist() for values in vars(shown).values())
+    given = (values.tolist() for values in (shown.items, shown.rewards, shown.returns))
     for row, (items, rewards, returns) in enumerate(zip(*given, strict=True)):
         repeated, likeness = weights_by_hand(made, returns, rewards)
         for (lag, item), other in product(enumerate(items), range(ITEMS)):
@@ -170,7 +170,8 @@ def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
         reward = found.rewards.view(B, K, lags)[b, t, lag - 1]
         assert not there or reward == given_windows.rewards[b, t - lag]
     chosen, rows = Exposed.before(given_windows, lags, given_windows.mask), given_windows.mask
-    for name, values in vars(chosen).items():
+    for name in ("items", "rewards", "returns"):
+        values = getattr(chosen, name)
         assert torch.equal(values, getattr(found, name)[rows.flatten()])
     last = Exposed.before_last(given_windows, lags)
     assert torch.equal(last.items, found.items[K - 1 :: K])

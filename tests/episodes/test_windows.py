@@ -18,6 +18,7 @@ from tests.support.episodes import (
     N_ITEMS,
     Logged,
     all_windows,
+    are_equal,
     random_action_copies,
     random_edits,
     random_episodes,
@@ -115,8 +116,7 @@ def test_copies_differ_from_their_source_at_the_edits_and_nowhere_else(
             if edit is not None:
                 assert not torch.equal(expected[row, column], torch.from_numpy(edit))
                 expected[row, column] = torch.from_numpy(edit)
-    for name, values in vars(replace(factual, states=expected)).items():
-        assert torch.equal(getattr(windows, name), values)
+    assert are_equal(windows, replace(factual, states=expected))
 
 
 def follow(episodes: list[Logged], augmented: AugmentedEpisodes, copy: int) -> Logged:
@@ -145,7 +145,7 @@ def test_action_copies_are_their_source_up_to_their_own_last_step(
     with tempfile.TemporaryDirectory() as name:
         store = write_store(Path(name) / "store", episodes, states, shard_steps=6)
         store = store.with_return_to_go(definition)
-        logged = vars(all_windows(store, length))
+        logged = all_windows(store, length)
         augmented = random_action_copies(store, 4, seed)
         training = TrainingEpisodes(store, random_edits(store, edits, seed)[0].join(augmented))
         first = len(store) + edits
@@ -167,8 +167,8 @@ def test_action_copies_are_their_source_up_to_their_own_last_step(
                 assert not value[0][~valid].any()
         # The logged episodes do not notice the copies.
         drawn = training.windows(*store.all_steps(), length)
-        for windows in (vars(all_windows(store, length)), vars(drawn)):
-            assert all(torch.equal(values, logged[name]) for name, values in windows.items())
+        for windows in (all_windows(store, length), drawn):
+            assert are_equal(windows, logged)
 
 
 @pytest.mark.parametrize("items", [True, False])

@@ -114,7 +114,8 @@ def all_windows(store: EpisodeStore, length: int) -> Windows:
 
 
 def are_equal(a: Windows, b: Windows) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+    pairs = zip(vars(a).values(), vars(b).values(), strict=True)
+    return all(x is y or torch.equal(x, y) for x, y in pairs)
 
 
 def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float64Array:

@@ -15,7 +15,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import ItemHead
-from ucfrec.schema import FORBIDDEN, USER_IDS
+from ucfrec.schema import FORBIDDEN, OFFER, USER_IDS
 
 
 class PolicyActor:
@@ -88,7 +88,8 @@ class PolicyActor:
             self._shown = self._shown[rows]
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Record the users of the next step (`USER_IDS`) and its forbidden items (`FORBIDDEN`).
+        """Record the users of the next step (`USER_IDS`), its forbidden items (`FORBIDDEN`) and
+        what is on offer (`OFFER`).
 
         Raises:
             InputError: items are forbidden, but the policy's actions are vectors.
@@ -97,6 +98,7 @@ class PolicyActor:
         if users is not None and lookup is not None:
             numbers = torch.from_numpy(lookup.numbers(users))
             self._sessions = replace(self._sessions, users=numbers)
+        self._sessions = replace(self._sessions, offer=info.get(OFFER))
         self._forbidden, forbidden = None, info.get(FORBIDDEN)
         if forbidden is None:
             return

@@ -267,7 +267,11 @@ class Scorer:
                     without[left_out] = True
                 if excluded is not None:
                     without |= excluded
-                return _require_scores(self.engine(sessions, without), empty)
+                if sessions.offer is not None:
+                    without |= ~sessions.offer.mask()
+                scores = self.engine(sessions, without)
+                scores = scores + self.rule.reward_weight * self._sum_running(sessions)
+                return _require_scores(scores, empty)
             return self.scores_of(self.query(sessions), left_out, excluded, empty=empty)
 
     @torch.no_grad()
@@ -283,15 +287,19 @@ class Scorer:
         rule, items = self.rule, self._items
         if self._is_plain:
             scores = items.scores(query, True, rule.reward_weight)
+            if rule.reward_weight and query.sessions.offer is not None:
+                scores = scores + rule.reward_weight * self._sum_running(query.sessions)
         else:
             if rule.policy_weight:
                 scores = rule.policy_weight * items.scores(query, True, 0.0)
             else:
                 scores = torch.zeros(query.items.shape[0], items.count)
+            if rule.looks_ahead or rule.reward_weight:
+                odds = items.scores(query, False, 1.0) + self._sum_running(query.sessions)
             if rule.looks_ahead:
-                scores = self._add_lookahead(scores, items.scores(query, False, 1.0), query)
+                scores = self._add_lookahead(scores, odds, query)
             elif rule.reward_weight:
-                scores = scores + rule.reward_weight * items.scores(query, False, 1.0)
+                scores = scores + rule.reward_weight * odds
         exporting = torch.compiler.is_exporting()
         if not exporting:
             _require_scores(scores, empty=True)
@@ -299,6 +307,8 @@ class Scorer:
             scores[left_out] = -torch.inf
         if excluded is not None:
             scores = scores.masked_fill_(excluded, -torch.inf)
+        if query.sessions.offer is not None:
+            scores = scores.masked_fill_(~query.sessions.offer.mask(), -torch.inf)
         for without in items.without_tags(rule, query.sessions.shown):
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
@@ -312,9 +322,13 @@ class Scorer:
         states = sessions.windows(self.states, 1).states[:, -1]
         part = self._items.model_part(sessions, states)
         items = self._items.pad_items(sessions.shown)
-        return self._items.scores(
-            Query(sessions, states, items, None, None, None, part), False, 1.0
-        )
+        query = Query(sessions, states, items, None, None, None, part)
+        return self._items.scores(query, False, 1.0) + self._sum_running(sessions)
+
+    def _sum_running(self, sessions: Sessions) -> Tensor:
+        """(B, n_items) what running rates and ages add to f̂_r; 0 without."""
+        model = self.reward_model
+        return torch.zeros(()) if model is None else model.sum_running(sessions.offer)
 
     @torch.inference_mode()
     def scores_of_some(
@@ -334,6 +348,14 @@ class Scorer:
         """
         rewards = bool(self.rule.reward_weight)
         scores = products + self._items.addends(query.items, part, candidates, rewards)
+        if query.sessions.offer is not None:
+            if rewards:
+                running = self._sum_running(query.sessions).expand(
+                    len(candidates), self._items.count
+                )
+                scores = scores + self.rule.reward_weight * running.gather(1, candidates)
+            offered = query.sessions.offer.mask().gather(1, candidates)
+            scores = scores.masked_fill(~offered, -torch.inf)
         for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
             scores = scores.masked_fill(without, -torch.inf)
         return scores

@@ -152,7 +152,11 @@ class RuleSearch:
         new = self.users.reward_report.new_users
         self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
-        self._supported = train.item_counts() >= self._config.least_impressions
+        counts = train.item_counts()
+        if problem.validation.has_offers:
+            # What is new in the validation sessions is not in the training ones.
+            counts = counts + problem.validation.item_counts()
+        self._supported = counts >= self._config.least_impressions
         self.least_items = float(min(self._config.least_items, self._supported.sum() / 4))
         self._many, self._few = (
             LoggedEvidence(problem.scorer, problem.validation, most, seed) for most in _LOGGED_STEPS
@@ -227,7 +231,7 @@ class RuleSearch:
         decisions = list[IntArray]()
         with progress(len(live), "choose the rule", "sessions") as bar:
             while len(live):
-                actor.inform({schema.USER_IDS: simulator.users})
+                actor.inform({schema.USER_IDS: simulator.users, schema.OFFER: simulator.offer})
                 items, _ = actor.act(simulator.observations(), np.ones(len(live), dtype=bool))
                 rewards, going = simulator.step(items)
                 actor.observe(items, rewards)

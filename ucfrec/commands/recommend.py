@@ -41,6 +41,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     that the log of the run has for it (default: all)"""
     new_session: Annotated[bool, Group("answering")] = False
     """Recommend for the first step of a new session (default: the user's latest one goes on)"""
+    at: Annotated[str | None, Group("answering"), "TIME"] = None
+    """Time of the requests, ISO 8601 or ms, at which items must be available (default: now)"""
     approximate: Annotated[bool, Group("answering")] = False
     """Find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule without a
     temperature; says the recall (default: exactly)"""
@@ -70,6 +72,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             "filter_seen": not self.keep_seen,
             "skip_unknown": self.skip_unknown,
             "new_session": self.new_session,
+            "at": self.at,
             "seed": self.seed,
         }
         if master is not None:
@@ -148,6 +151,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             or self.spark_master,
             "--stream finds items exactly; leave --approximate out": self.approximate,
             "with --stream, each line says new_session; leave --new-session out": self.new_session,
+            "with --stream, requests are of now; leave --at out": self.at,
             "with --stream, each line has its candidates; leave --candidates out": self.candidates,
         }
         for message, refused in refusals.items():

@@ -298,6 +298,7 @@ def read_transitions(
     rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
     items = rows.items if actions is None else torch.from_numpy(actions)
     fixed = item_rewards.score_without_state(rows.history, rows.users, items)
+    fixed = fixed + item_rewards.sum_running(rows.offer, items)
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ucfrec.arrays import Float32Array, Float64Array
+from ucfrec.episodes.offers import columns_of
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Exposed
 
@@ -253,9 +254,3 @@ def quantiles(values: Float32Array, levels: Float64Array) -> Float64Array:
     # As numpy interpolates, from the nearer value.
     near_low, near_high = low + (high - low) * share, high - (high - low) * (1 - share)
     return np.asarray(np.where(share < 0.5, near_low, near_high))
-
-
-def columns_of(items: Tensor, among: Tensor) -> Tensor:
-    """Positions of `items` (...) in `among` (L,), int64, ascending; −1 for items not in it."""
-    columns = torch.searchsorted(among, items).clamp(max=len(among) - 1)
-    return torch.where(among[columns] == items, columns, -1)

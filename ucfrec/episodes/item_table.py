@@ -15,6 +15,10 @@ from ucfrec.files.atomic import atomic_file
 
 ITEM_STATES: Final = "item_states.safetensors"
 """Name of the file in a store or a run."""
+OFFERS: Final = "offers.safetensors"
+"""Name of the file of `Offers` in a store or a run; missing where everything is always on offer."""
+ALWAYS: Final = -(2**62), 2**62
+"""Begin and end, in ms, of an interval without bounds."""
 DISTINCT_TAGS: Final = 1000
 """Most tags of a catalogue that are distinguished; rarer ones are excluded."""
 TAGS_PER_ITEM: Final = 16

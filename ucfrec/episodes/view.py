@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
+from ucfrec.episodes.offers import Offer, Offers
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
@@ -120,6 +122,14 @@ class Columns:
         """See `EpisodeView.item_states`."""
         self.record.require(self.path, ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
+
+    @cached_property
+    def offers(self) -> Offers | None:
+        """When items are available; None where all always are."""
+        if not (self.path / OFFERS).is_file():
+            return None
+        self.record.require(self.path, OFFERS)
+        return Offers.load(self.path / OFFERS, len(self.item_states.embeddings))
 
     @property
     def has_item_states(self) -> bool:
@@ -338,6 +348,19 @@ class EpisodeView:
         index = self._columns.starts[self.episode_ids[episodes]] + steps
         return self._columns.step_column(name).take(index)
 
+    @property
+    def has_offers(self) -> bool:
+        """Whether items come and go; otherwise all are always on offer."""
+        return self._columns.offers is not None
+
+    def offer(self, episodes: IntArray, steps: IntArray) -> Offer | None:
+        """What was on offer at steps of episodes, as `step_values`; None for everything."""
+        offers = self._columns.offers
+        if offers is None:
+            return None
+        times = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+        return Offer(offers, torch.from_numpy(times))
+
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""
         owner, earlier_steps = list_earlier(steps)
@@ -420,7 +443,8 @@ class EpisodeView:
         if self.has_items:
             actions = actions.long()
         states = columns.states(numbers, steps)
-        return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
+        windows = Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
+        return replace(windows, offer=self.offer(episodes[:, None], steps.clip(min=0)))
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
         """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
@@ -29,7 +30,11 @@ class _Rows:
 
     def _change(self, change: Callable[[Tensor], Tensor]) -> Self:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        changed = {name: change(value) for name, value in values.items() if value is not None}
+        changed: dict[str, Any] = {
+            name: value.change(change) if isinstance(value, Offer) else change(value)
+            for name, value in values.items()
+            if value is not None
+        }
         return replace(self, **changed)
 
     def at(self, rows: slice | IntArray | Tensor) -> Self:
@@ -57,6 +62,8 @@ class Windows(_Rows):
     """(B, K) int64 number of the step in its episode, from 0."""
     mask: Tensor
     """(B, K) bool, true at steps of the episode, false at padding."""
+    offer: Offer | None = None
+    """What was on offer at each of the (B, K) steps; None for everything."""
 
     def __repr__(self) -> str:
         (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
@@ -92,8 +99,12 @@ class Windows(_Rows):
     @classmethod
     def joined(cls, parts: Sequence["Windows"]) -> "Windows":
         """The windows of all parts, one part after the other."""
-        names = [f.name for f in fields(cls)]
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        columns: dict[str, Any] = {
+            name: torch.cat([getattr(part, name) for part in parts])
+            for name, value in vars(parts[0]).items()
+            if isinstance(value, Tensor)
+        }
+        return cls(**columns)
 
     def last(self, steps: int) -> "Windows":
         """The windows of this number of last steps."""
@@ -173,8 +184,9 @@ class Shown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Exposed:
-    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
+class Exposed(_Rows):
+    """The items shown before each of M steps with their rewards, the step's return-to-go, and what
+    was on offer."""
 
     items: Tensor
     """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
@@ -182,6 +194,8 @@ class Exposed:
     """(M, N) their rewards, in reward units."""
     returns: Tensor
     """(M,) returns-to-go in units of the policy's return scale."""
+    offer: Offer | None = None
+    """Of the M steps; None for everything."""
 
     @classmethod
     def before(
@@ -193,17 +207,20 @@ class Exposed:
         """For every step t of B windows of K steps, or those in a mask (B, K): steps t − 1 to
         t − `lags` of the same window."""
         items = windows.actions.masked_fill(~windows.mask, -1)
-        parts = [_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0)]
-        parts.append(windows.returns_to_go.flatten())
-        if steps is not None:
-            parts = [part[steps.flatten()] for part in parts]
-        return cls(*parts)
+        exposed = cls(
+            _earlier(items, lags, -1),
+            _earlier(windows.rewards, lags, 0),
+            windows.returns_to_go.flatten(),
+            windows.offer and windows.offer.change(torch.flatten),
+        )
+        return exposed if steps is None else exposed._change(lambda part: part[steps.flatten()])
 
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
         """For the last step of B windows, as `before`, (B, lags)."""
         recent = Shown.before_last(windows.last(lags + 1)).padded(lags)
-        return cls(recent.items, recent.rewards, windows.returns_to_go[:, -1])
+        offer = windows.offer and windows.offer.change(lambda part: part[:, -1])
+        return cls(recent.items, recent.rewards, windows.returns_to_go[:, -1], offer)
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
@@ -232,6 +249,8 @@ class Sessions(_Rows):
     any."""
     states: Tensor | None = None
     """(B, K, S) float32 of the last K steps or more, where they are known; None to build them."""
+    offer: Offer | None = None
+    """What is on offer at the step to decide; None for everything."""
 
     @classmethod
     def begun(
@@ -304,6 +323,7 @@ class Sessions(_Rows):
             torch.from_numpy(store.rewards_before(episodes, steps)),
             torch.from_numpy(users),
             states=store.windows(episodes, steps, context).states,
+            offer=store.offer(episodes, steps),
         )
 
     def begin(self, rows: IntArray) -> None:

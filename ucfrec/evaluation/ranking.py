@@ -161,6 +161,8 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
         if batch.left_out is not None:
             scores = scores.expand(len(numbers), n_items).clone()
             scores[batch.left_out] = -torch.inf
+        if (offer := store.offer(batch.episodes, batch.steps)) is not None:
+            scores = scores.masked_fill(~offer.mask(), -torch.inf)
         top = best_items(scores, k)
         listed_items = top.masked_fill(torch.isneginf(scores.gather(1, top)), -1)
         parts.append(listed_items.expand(len(numbers), k).numpy())

@@ -70,12 +70,14 @@ def explain(
     Raises:
         InputError: the rule does not fit the policy, or an item of the history is not known.
     """
-    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen)
+    at = None if trained.offers is None else int(user.timestamps.max(initial=0))
+    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen, at=at)
     # The user's latest session, before the step that is decided.
     numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)
     sessions = sessions_of(trained, latest, trained.scorer().length)
-    parts = _score_parts(trained.scorer(rule), sessions)
+    offer = None if trained.offers is None else trained.offers.at(torch.tensor([at]))
+    parts = _score_parts(trained.scorer(rule), replace(sessions, offer=offer))
     ids = frame[schema.ITEM_ID].to_numpy()
     cards = [
         Card(item_id, chance, {name: float(part[number]) for name, part in parts.items()})
@@ -143,7 +145,8 @@ def _score_parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
         unexposed = alone.scores_of(query, empty=True)[0].double()
     rewarded = score(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
     sums = torch.stack((torch.zeros_like(exposed), unexposed, exposed, rewarded, score()))
-    parts = sums.diff(dim=0)
+    # Scores of what is not available are −∞.
+    parts = sums.diff(dim=0).nan_to_num(nan=0.0, neginf=0.0)
     return dict(zip(PARTS, parts - parts.mean(1, keepdim=True), strict=True))
 
 

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder
@@ -318,7 +319,10 @@ def _write(
     _move_train_counts(typed, shards)
     fill = {name: float(_FILL.get(name, np.nan)) for name in (*old.columns, *added)}
     with progress(log.report["steps"], "write the new shards", "steps") as bar:
-        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill)
+        offers = log.read_offers(store)
+        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, offers)
+    if offers is not None:
+        offers.save(folder / OFFERS)
     new = writer.finish(log.report["reward"], log.report, write_ids(typed, folder))
     expired = sum(int(shard.lengths[~shard.stays].sum()) for shard in shards)
     report = {**log.report, **counts, "expired_steps": expired}

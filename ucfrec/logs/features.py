@@ -12,7 +12,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, OFFERS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
@@ -31,9 +31,12 @@ from ucfrec.logs.tables import (
     quote_name,
     raw_name,
 )
+from ucfrec.logs.typed import cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+    from ucfrec.episodes.offers import Offers
 
 _KINDS = {
     "DOUBLE": "numbers",
@@ -45,6 +48,7 @@ CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
+_TIMES = ("available_from", "available_until")
 _MANY_LACKING = 0.2
 """Share of the ids without a row above which a note says so."""
 
@@ -72,23 +76,79 @@ def load_features(
     for name, table in zip(names, tables, strict=True):
         opened, types = open_tables(connection, log_files(table.files)), _Types()
         parts = [_select_part(connection, part, table, kind, id_type, types) for part in opened]
-        values = "".join(
-            f", CAST(f{n} AS {'VARCHAR' if type_ == NOTHING else type_}) AS f{n}"
+        values = [
+            f"CAST(f{n} AS {'VARCHAR' if type_ == NOTHING else type_}) AS f{n}"
             for n, (type_, _) in enumerate(types.values())
-        )
+        ]
+        rows = f"({' UNION ALL BY NAME '.join(parts)})"
         with explain_errors(connection, opened):
+            times = [time for time in connection.sql(f"FROM {rows}").columns if time in _TIMES]
+            columns = ", ".join(["id", *values, *times])
             connection.execute(
-                f"CREATE TABLE {name} AS SELECT id{values} FROM "
-                f"({' UNION ALL BY NAME '.join(parts)}) WHERE id IS NOT NULL"
+                f"CREATE TABLE {name} AS SELECT {columns} FROM {rows} WHERE id IS NOT NULL"
             )
+        if times:
+            _split_times(connection, name, table)
         counts = f"SELECT count(*), count(DISTINCT id) FROM {name}"
-        ((rows, ids),) = connection.sql(counts).fetchall()
-        if rows != ids:
+        ((count, ids),) = connection.sql(counts).fetchall()
+        if count != ids:
             raise InputError(
-                f"{', '.join(map(str, table.files))}: {rows - ids} of {rows} rows "
+                f"{', '.join(map(str, table.files))}: {count - ids} of {count} rows "
                 f"repeat a {table.key}; keep one row per {kind}"
             )
     return names
+
+
+def _split_times(connection: duckdb.DuckDBPyConnection, name: str, table: FeatureTable) -> None:
+    """Move the times of a feature table to a table of their own, which may repeat an id."""
+    begin, until = _TIMES
+    connection.execute(
+        f"CREATE TABLE {name}_times AS SELECT DISTINCT id, {begin}, {until} FROM {name}"
+    )
+    empty = _count(connection, f"{name}_times WHERE {begin} >= {until}")
+    if empty:
+        raise InputError(
+            f"{', '.join(map(str, table.files))}: {empty:,} of {_count(connection, name):,} rows "
+            "are available until a time that is not after that from which they are; correct them"
+        )
+    connection.execute(
+        f"CREATE OR REPLACE TABLE {name} AS "
+        f"SELECT DISTINCT * EXCLUDE ({begin}, {until}) FROM {name}"
+    )
+
+
+def _list_times(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> list[str]:
+    """The tables of times that belong to feature tables."""
+    created = {name for (name,) in connection.sql("SHOW TABLES").fetchall()}
+    return [f"{name}_times" for name in names if f"{name}_times" in created]
+
+
+def read_offers(
+    connection: duckdb.DuckDBPyConnection,
+    names: Sequence[str],
+    n_items: int,
+    store: Path | None,
+) -> "Offers | None":
+    """When the items of a store are available, as of feature tables; items that these lack as in
+    the older `store`. None where nobody says."""
+    tables = _list_times(connection, names)
+    has_older = store is not None and (store / OFFERS).is_file()
+    if not tables and not has_older:
+        return None
+    from ucfrec.episodes.offers import Offers  # imports torch
+
+    intervals = np.zeros((3, 0), dtype=np.int64)
+    begin, until = (f"coalesce({name}, {n})" for name, n in zip(_TIMES, ALWAYS, strict=True))
+    for name in tables:
+        rows = connection.sql(
+            f"SELECT number::BIGINT, {begin}, {until} "
+            f"FROM items JOIN {name} ON {schema.ITEM_ID} = id"
+        ).fetchnumpy()
+        intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
+    if store is not None and has_older:
+        older = Offers.load(store / OFFERS).intervals
+        intervals = np.hstack([intervals, older[:, ~np.isin(older[0], intervals[0])]])
+    return Offers.of(n_items, intervals)
 
 
 def count_features(
@@ -113,7 +173,8 @@ def _select_part(
     """SQL of the rows of a part of a table: `id`, and of the features in `types`, to which it adds,
     those that it has as `f0`, …."""
     key = bind(connection, opened, f"key of {kind} features", table.key)
-    key_columns = {name.casefold() for name in key.columns}
+    times = _bind_times(connection, opened, table, kind)
+    key_columns = {name.casefold() for bound in (key, *times.values()) for name in bound.columns}
     names = table.columns or tuple(
         name
         for name in opened.columns
@@ -147,9 +208,31 @@ def _select_part(
         # Ties are broken by the features, so that the order of rows does not matter.
         ties = ", ".join([order.sql, *values.values()])
         first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {ties}) = 1"
-    columns = (column for source in sources for column in source.columns)
+    columns = (column for source in (*sources, *times.values()) for column in source.columns)
+    narrow = opened.of(columns, raw)
+    for name, time in times.items():
+        values[name] = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)[0]
     features = "".join(f", {sql} AS {name}" for name, sql in values.items())
-    return f"SELECT {id_sql} AS id{features} FROM {opened.of(columns, raw).sql}{first}"
+    return f"SELECT {id_sql} AS id{features} FROM {narrow.sql}{first}"
+
+
+def _bind_times(
+    connection: duckdb.DuckDBPyConnection,
+    opened: Table,
+    table: FeatureTable,
+    kind: str,
+) -> dict[str, Bound]:
+    """`available_from` and `available_until` of items; a table that has one of them has both."""
+    if kind != schema.ITEM_ID:
+        return {}
+    columns = {name.casefold() for name in opened.columns}
+    texts = {name: getattr(table, name) or (name if name in columns else "") for name in _TIMES}
+    if not any(texts.values()):
+        return {}
+    return {
+        name: bind(connection, opened, f"for {name} of items", text or "CAST(NULL AS TIMESTAMP)")
+        for name, text in texts.items()
+    }
 
 
 def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
@@ -188,10 +271,10 @@ def _cast_id(key: str, key_type: str, id_type: str) -> str:
 def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> str:
     """A digest of every id and value of feature tables, in whatever order their rows are."""
     digest = hashlib.sha256()
-    for name in names:
+    for name in [*names, *_list_times(connection, names)]:
         columns = connection.sql(f"DESCRIBE {name}").fetchall()
         digest.update(repr([column[:2] for column in columns]).encode())
-        rows = connection.sql(f"SELECT * FROM {name} ORDER BY id")
+        rows = connection.sql(f"SELECT * FROM {name} ORDER BY ALL")
         for batch in rows.to_arrow_reader(BATCH_ROWS):
             for column in batch.columns:
                 if str(column.type) == "double":

@@ -53,6 +53,12 @@ class FeatureTable:
     first_by: str = ""
     """Of rows with the same key, keep the one with the lowest value of this column or expression,
     e.g. the first day of daily features. Empty: a repeated key is an error."""
+    available_from: str = ""
+    """Of items: column or expression of the time from which the item may be shown; empty for the
+    column of this name, if there is one. Missing values have no bound. Rows that differ in times
+    alone are several intervals of one item."""
+    available_until: str = ""
+    """The time from which it may no longer be shown."""
 
     def __post_init__(self) -> None:
         for name, value in (("files", self.files), ("columns", self.columns)):
@@ -234,7 +240,10 @@ def read_mapping(path: Path) -> LogMapping:
                     files=tuple(_beside(path, file) for file in features.files),
                     key=Expression(features.key, origin),
                     columns=tuple(Expression(column, origin) for column in features.columns),
-                    first_by=Expression(features.first_by, origin),
+                    **{
+                        name: Expression(getattr(features, name), origin)
+                        for name in ("first_by", "available_from", "available_until")
+                    },
                 )
                 for features in (FeatureTable(**table) for table in values[kind])
             )

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pyarrow as pa
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
-from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
@@ -28,6 +28,7 @@ from ucfrec.logs.features import (
     encode_ids,
     feature_digest,
     load_features,
+    read_offers,
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
@@ -35,6 +36,9 @@ from ucfrec.logs.rows import SortedRows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.offers import Offers
 
 _REMEMBERED = ("duplicates", "dataset", "min_steps", "max_session")
 """Options that the record of a store has."""
@@ -154,15 +158,20 @@ def prepare(
             explain_errors(log.rows.log.connection, log.rows.log.tables, out.parent),
         ):
             typed, report = log.rows.log, log.report
+            offers = log.read_offers(None)
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(log.rows, log.cut, folder, bar)
+                writer = sessions.write_steps(log.rows, log.cut, folder, bar, offers=offers)
+            if offers is not None:
+                offers.save(folder / OFFERS)
             ids = sessions.write_ids(typed, folder)
             for name, tables in log.features.items():
                 if tables:
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]
             record = writer.finish(report["reward"], report, ids)
             if like is not None and typed.key == schema.ITEM_ID:
-                shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+                for name in (ITEM_STATES, OFFERS):
+                    if (like / name).is_file():
+                        shutil.copy(like / name, folder / name)
             elif typed.key == schema.ITEM_ID:
                 from ucfrec.logs.items import write_item_states  # imports scipy
 
@@ -196,6 +205,14 @@ class PreparedLog:
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
+
+    def read_offers(self, store: Path | None) -> "Offers | None":
+        """When items are available; of those that are in a `store` alone, as it says."""
+        if schema.ITEM_ID not in self.features:
+            return None
+        connection, names = self.rows.log.connection, self.features[schema.ITEM_ID]
+        ((n_items,),) = connection.sql("SELECT count(*) FROM items").fetchall()
+        return read_offers(connection, names, n_items, store)
 
 
 @contextmanager

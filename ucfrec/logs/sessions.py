@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -18,12 +18,15 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.writer import StoreWriter
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
 from ucfrec.logs.rows import CODES, ITEM, SESSION, USER, SortedRows
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import Progress
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.offers import Offers
 
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""
@@ -397,12 +400,14 @@ def write_steps(
     display: Progress,
     first_shard: int = 0,
     fill: Mapping[str, float] = MappingProxyType({}),
+    offers: "Offers | None" = None,
 ) -> StoreWriter:
     """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
-    out. Empty for those of the log.
+    out. Empty for those of the log. Warns of steps whose item is not available, as of `offers`.
     """
+    unavailable = total = 0
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
     users = _read_numbers(log, "users", schema.USER_ID)
     items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
@@ -410,6 +415,9 @@ def write_steps(
         columns, lengths = episodes.rows, episodes.lengths
         if ITEM in columns:
             columns[schema.ITEM] = items[columns[ITEM]]
+        if offers is not None and lengths.size:
+            unavailable += offers.count_unavailable(columns[schema.ITEM], columns[schema.TIMESTAMP])
+            total += len(columns[schema.ITEM])
         if rows.observations is not None:
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
         names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
@@ -429,6 +437,11 @@ def write_steps(
             {n: np.repeat(v, lengths) for n, v in values.items()},
         )
         display.update(count)
+    if unavailable:
+        warn_user(
+            f"{log.name}: {unavailable:,} of {total:,} rows show an item at a time at which the "
+            "table of items says it is not available; check the time zones of both"
+        )
     return writer
 
 

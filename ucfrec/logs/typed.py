@@ -279,7 +279,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         sources.append(condition)
     narrow = table.of((column for value in sources for column in value.columns), raw.values())
     values = {
-        name: _cast_value(connection, narrow, name, texts[name], value, time_format)
+        name: cast_value(connection, narrow, name, texts[name], value, time_format)
         for name, value in bound.items()
     }
     return narrow, {**values, **extra}
@@ -303,7 +303,7 @@ def _bind_reward(
         return table, bind(connection, table, "for the reward", reward)
 
 
-def _cast_value(
+def cast_value(
     connection: duckdb.DuckDBPyConnection,
     table: Table,
     name: str,

@@ -248,10 +248,10 @@ class SequencePolicy(nn.Module, ABC):
         last: bool = False,
     ) -> Exposed | None:
         """What was shown before each of the (B·K) steps, before the `steps` of a mask (B, K), or
-        before the `last` steps (B,) alone; None without `policy.exposure`."""
-        if self.head.exposure is None:
+        before the `last` steps (B,) alone; None without `policy.exposure` and offers."""
+        if self.head.exposure is None and windows.offer is None:
             return None
-        lags = self.head.exposure.lags
+        lags = 1 if self.head.exposure is None else self.head.exposure.lags
         if last:
             return Exposed.before_last(windows, lags)
         return Exposed.before(windows, lags, steps)

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import ExposureTerm, columns_of
+from ucfrec.episodes.exposure import ExposureTerm
+from ucfrec.episodes.offers import columns_of
 from ucfrec.episodes.windows import Exposed
 
 _AT_ONCE = 2**24
@@ -108,14 +109,22 @@ class ItemHead(nn.Module):
         self._kept: tuple[tuple[object, ...], Tensor] | None = None
         self._proposal: Proposal | None = None
 
-    def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
+    def start_from(
+        self,
+        embeddings: Tensor,
+        counts: Tensor,
+        even: Tensor | None = None,
+    ) -> None:
         """Set the embeddings (n_items, D), which are not copied, and, from training counts
-        (n_items,), the bias."""
+        (n_items,), the bias: the log of an item's share, or of its counts over those of `even`
+        draws (n_items,) from what was on offer, so that a new item begins as the mean one."""
         self.embeddings = embeddings.to(self.embeddings)
         self.counts.copy_(counts + 1)
         self._proposal = None
         with torch.no_grad():
-            self.bias.copy_(torch.log(self.counts / self.counts.sum()))
+            self.bias.copy_(
+                torch.log(self.counts / (self.counts.sum() if even is None else even + 1))
+            )
 
     def vectors(self, items: Tensor) -> Tensor:
         """Vectors (..., d) of int64 items (...,)."""
@@ -166,9 +175,13 @@ class ItemHead(nn.Module):
         bias = self.bias if items is None else self._gather_bias(items) + offset
         # Scaling the features instead of the logits saves two passes over the larger of them.
         logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
-        if self.exposure is not None and exposed is not None:
-            return self.exposure.added_to(logits, exposed, items)
-        return logits
+        if exposed is None:
+            return logits
+        if self.exposure is not None:
+            logits = self.exposure.added_to(logits, exposed, items)
+        if exposed.offer is None:
+            return logits
+        return logits.masked_fill(~exposed.offer.mask(items).to(logits.device), -torch.inf)
 
     def losses(
         self,
@@ -179,7 +192,8 @@ class ItemHead(nn.Module):
         """The negative log-likelihood (nats) of each of M steps, (M,): features (M, d), actions
         (M,)."""
         if not self.samples:
-            return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
+            logits = self._predict_with(actions, features, exposed)
+            return F.cross_entropy(logits, actions, reduction="none")
         logit = self.logit(features, actions, exposed)
         if not self.training:
             # The softmax over all items, some at once.
@@ -195,6 +209,15 @@ class ItemHead(nn.Module):
         rows = torch.nonzero(column >= 0)[:, 0]
         logits = logits.index_put_((rows, column[rows]), logits.new_tensor(-torch.inf))
         return torch.logaddexp(logits.logsumexp(-1), logit) - logit
+
+    def _predict_with(self, actions: Tensor, features: Tensor, exposed: Exposed | None) -> Tensor:
+        """`predict`; the logged items (M,) count as on offer, whatever the table of items says."""
+        logits = self.predict(features, exposed)
+        if exposed is None or exposed.offer is None:
+            return logits
+        return logits.scatter(
+            1, actions.unsqueeze(1), self.logit(features, actions, exposed).unsqueeze(1)
+        )
 
     def entropy(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean entropy (nats) of the distributions at M steps; estimated from samples as losses."""

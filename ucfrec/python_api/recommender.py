@@ -251,6 +251,7 @@ class Recommender:
         candidates: Iterable[Any] | None = None,
         skip_unknown: bool = False,
         new_session: bool = False,
+        at: str | float | None = None,
         rule: DecisionRule | None = None,
         seed: int = 0,
         mapping: Columns | None = None,
@@ -273,6 +274,8 @@ class Recommender:
             skip_unknown: ignore rows of items that are not in the training data, and such
                 candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
+            at: time of the requests, ISO 8601 or ms: only items that are available then are
+                recommended. None for now.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on
                 the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
@@ -295,6 +298,7 @@ class Recommender:
             candidates=candidates,
             skip_unknown=skip_unknown,
             new_session=new_session,
+            at=at,
         )
         with use_words_of_python():
             return pd.concat(frames, ignore_index=True)

@@ -57,8 +57,9 @@ _MEANINGS = {
 }
 _NOTES = (
     "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
-    "and tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
-    "draw from `scores` divided by it, with top_k among so many best; with explore, draw that "
+    "and tag_run; put into `excluded` what is not available and, with exclude_seen, the session's "
+    "items; with a temperature, draw from `scores` divided by it, with top_k among so many best; "
+    "with explore, draw that "
     "share of the requests uniformly, with explore_top among so many best"
 )
 _SERVE = "use `ucfrec serve` or `recommend --stream`"
@@ -95,6 +96,12 @@ def export(
     """
     _require_installed()
     graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
+    model = graph.scorer.reward_model
+    if graph.scorer.rule.reward_weight and model is not None and model.running.any():
+        raise InputError(
+            f"{trained.folder}: scores depend on the time of the request, as items come and go; "
+            f"{_SERVE}, or export a rule with reward weight 0"
+        )
     example = _draw_inputs(graph.scorer, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: list[dict[int, Any]] = [{0: batch} for _ in example]
@@ -136,7 +143,8 @@ class _Network(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
         *session, excluded = inputs
-        return (self.scorer.scores(Sessions(*session), excluded=excluded, empty=True),)
+        sessions = Sessions(*session)  # type: ignore[arg-type]
+        return (self.scorer.scores(sessions, excluded=excluded, empty=True),)
 
 
 class RuleGraph(_Network):

@@ -1,5 +1,6 @@
 """Recommend next items to users of logs, also to new ones; similar items; an approximate search."""
 
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -19,6 +20,7 @@ from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.logs.rows import mix_bits
+from ucfrec.recommending.requests import parse_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, require_whole
 
@@ -55,6 +57,7 @@ def recommend(
     candidates: Iterable[Any] | None = None,
     skip_unknown: bool = False,
     new_session: bool = False,
+    at: str | float | None = None,
     seed: int = 0,
     index: "ItemIndex | None" = None,
 ) -> Iterator[pd.DataFrame]:
@@ -75,6 +78,8 @@ def recommend(
         skip_unknown: ignore rows of items that are not in the training data, and such candidates
             where others are left.
         new_session: whether users begin a new session.
+        at: time of the requests, ISO 8601 or ms: items that are not available then are not
+            recommended; None for now.
         seed: of the draws of a rule with a temperature, or that explores. They also depend on the
             user and the time of the user's last row: the same history gives the same items, and a
             later one draws anew.
@@ -92,13 +97,14 @@ def recommend(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    chooser = Chooser(trained, trained.item_scorer(rule), seed, index)
+    chooser = Chooser(trained, trained.item_scorer(rule), seed, index, _read_time(at))
     k, excluded, remaining = require_whole("k", k), None, iter(batches)
     if candidates is not None:
         ids = require_ids("candidates", candidates, schema.ITEM_ID)
         excluded = torch.ones(len(trained.items), dtype=torch.bool)
         allowed = candidate_numbers(trained.items, ids, skip_unknown)
         excluded[torch.from_numpy(allowed)] = False
+    _require_available(trained, chooser.request_times(1), excluded)
 
     def to_frame(batch: Histories) -> pd.DataFrame:
         histories = batch.with_numbers(trained.items, filter_seen)
@@ -125,6 +131,26 @@ def recommend(
     return map(to_frame, remaining)
 
 
+def _require_available(trained: TrainedPolicy, time: Tensor, excluded: Tensor | None) -> None:
+    """Check that some item, or candidate, is available at a time (1,) in ms."""
+    if trained.offers is None:
+        return
+    offered = trained.offers.at(time).mask()
+    if not (offered if excluded is None else offered & ~excluded).any():
+        clock = pd.Timestamp(int(time), unit="ms")
+        raise InputError(
+            f"{trained.folder}: no item is available at {clock:%Y-%m-%d %H:%M} UTC; give the time "
+            "of requests with --at (at=... in Python), or a newer table of items to ucfrec update"
+        )
+
+
+def _read_time(at: str | float | None) -> int | None:
+    try:
+        return None if at is None else round(parse_time(at))
+    except ValueError as error:
+        raise InputError(f"the time of the requests is {at!r:.60}; {error}") from None
+
+
 @dataclass(frozen=True)
 class Chooser:
     """Chooses items for the next step of users under a decision rule."""
@@ -133,6 +159,12 @@ class Chooser:
     scorer: Scorer
     seed: int
     index: "ItemIndex | None" = None
+    at_ms: int | None = None
+    """Time at which items must be available, ms; None for that of each call."""
+
+    def request_times(self, count: int) -> Tensor:
+        """(count,) int64 ms, all the same."""
+        return torch.full((count,), round(time.time() * 1000) if self.at_ms is None else self.at_ms)
 
     def choose(
         self,
@@ -190,6 +222,9 @@ class Chooser:
         """`choose` with one forward pass, of latest sessions."""
         rule = self.scorer.rule
         sessions = sessions_of(self.trained, latest, self.scorer.length)
+        if self.trained.offers is not None:
+            offer = self.trained.offers.at(self.request_times(len(requests)))
+            sessions = replace(sessions, offer=offer)
         # What was seen, and what the latest sessions have shown, if the rule excludes it.
         in_catalogue = latest.seen_ids >= 0
         rows, seen = latest.seen_owner[in_catalogue], latest.seen_ids[in_catalogue]

@@ -56,10 +56,12 @@ _MEMORY = "512MB"
 of it."""
 
 
-def _parse_time(value: float | str) -> float:
+def parse_time(value: float | str) -> float:
     """A time of a request in milliseconds since 1970; ValueError for text that is not ISO 8601."""
     if not isinstance(value, str):
         return value
+    if value.isdecimal():
+        return float(value)
     try:
         time = datetime.fromisoformat(value.strip())
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
@@ -95,7 +97,7 @@ class Row(TypedDict):
     timestamp: Annotated[
         Number | Annotated[str, Field(max_length=64)],
         Field(description="Milliseconds since 1970, UTC; or ISO 8601 text, UTC without a zone."),
-        AfterValidator(_parse_time),
+        AfterValidator(parse_time),
     ]
     reward: NotRequired[
         Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model import INITIAL
+from ucfrec.episodes.item_table import OFFERS
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -37,6 +40,10 @@ _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 _SCALES = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
 """Buffers of a policy that its weights were trained with."""
+_OFFERED = 2**28
+"""Most pairs of a step and an item of which it is asked whether the item was on offer, …"""
+_AT_ONCE = 2**20
+"""… and of which it is asked at once."""
 _CRM_EPOCHS = 5
 """Epochs that `crm.epochs` 0 stands for."""
 
@@ -156,20 +163,57 @@ def begin(
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
         rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
         write_json(scratch / RULE, rule.as_dict())
-        for name in (ITEM_STATES, ITEMS, USERS):
+        for name in (ITEM_STATES, OFFERS, ITEMS, USERS):
             with suppress(FileNotFoundError):
                 shutil.copyfile(store.path / name, scratch / name)
         if store.has_items:
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
-            items = torch.from_numpy(validation.column(schema.ITEM)).long()
-            # As the bias of `ItemHead` is initialised.
-            log_shares = torch.log((counts.shown + 1) / (counts.shown + 1).sum())
             entries["reference_losses"] = {
-                "uniform": math.log(len(counts.shown)),
-                "popularity": -float(log_shares[items].double().mean()),
+                name: _mean_loss(validation, scores)
+                for name, scores in (
+                    ("uniform", torch.zeros(len(counts.shown))),
+                    # As the bias of `ItemHead` is initialised.
+                    ("popularity", torch.log(counts.shown + 1.0)),
+                )
             }
         RunRecord.of(entries, out / RUN).seal(scratch)
+
+
+def _count_even_draws(train: EpisodeStore) -> Tensor | None:
+    """(n_items,) expected counts of items drawn evenly from what was on offer; None for all."""
+    counts, steps = torch.zeros(len(train.item_states.embeddings)), 0
+    for offer, _ in _sample_offers(train):
+        if offer is None:
+            return None
+        offered = offer.mask().float()
+        counts += (offered / offered.sum(1, keepdim=True).clamp(min=1)).sum(0)
+        steps += len(offered)
+    return counts * (train.n_steps / max(1, steps))
+
+
+def _mean_loss(view: EpisodeStore, scores: Tensor) -> float:
+    """Mean −log softmax (nats), over what was on offer, of the scores (n_items,) of items shown."""
+    losses = []
+    for offer, items in _sample_offers(view):
+        if offer is None:
+            shown = torch.from_numpy(view.column(schema.ITEM)).long()
+            return -float(scores.log_softmax(0)[shown].double().mean())
+        offered = offer.mask().scatter(1, items.unsqueeze(1), True)
+        logs = scores.masked_fill(~offered, -torch.inf).log_softmax(1)
+        losses.append(-logs.gather(1, items.unsqueeze(1)))
+    return float(torch.cat(losses).double().mean()) if losses else math.nan
+
+
+def _sample_offers(view: EpisodeStore) -> Iterator[tuple[Offer | None, Tensor]]:
+    """What was on offer at steps of the view, evenly spaced if they are many, and the items shown,
+    some steps at a time."""
+    n_items = len(view.item_states.embeddings)
+    numbers = np.arange(0, view.n_steps, -(-view.n_steps * n_items // _OFFERED) or 1)
+    for part in np.array_split(numbers, -(-len(numbers) * n_items // _AT_ONCE) or 1):
+        episodes, steps = view.locate(part)
+        items = view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        yield view.offer(episodes, steps), torch.from_numpy(items)
 
 
 def policy_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -198,7 +242,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = torch.from_numpy(train.item_counts()).float()
-        policy.head.start_from(train.item_states.embeddings, counts)
+        policy.head.start_from(train.item_states.embeddings, counts, _count_even_draws(train))
         if policy.head.exposure is not None:
             scaled = torch.from_numpy(returns_to_go) / policy.return_scale
             policy.head.exposure.start_from(train.item_states, scaled)

@@ -13,7 +13,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.item_table import OFFERS, IdLookup
+from ucfrec.episodes.offers import Offers
 from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, damage_explained, warn_user
@@ -35,7 +36,7 @@ COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
-INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
+INPUTS = (ITEM_STATES, OFFERS, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 
 
@@ -63,6 +64,8 @@ class TrainedPolicy:
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
     session_end: SessionEnd | None = None
     """When users leave, for decision rules with a lookahead; None if the run fitted none."""
+    offers: Offers | None = None
+    """When items are available; None where all always are."""
 
     @classmethod
     def load(
@@ -94,12 +97,13 @@ class TrainedPolicy:
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
         weights, fitted = f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"
-        record.require(folder, ITEM_STATES, weights, fitted)  # however large
+        record.require(folder, ITEM_STATES, OFFERS, weights, fitted)  # however large
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
         states, models, reward_model = folder / ITEM_STATES, folder / REWARD_MODEL, None
+        offers = folder / OFFERS
         if (models / FITTED).exists():
             tensors, _ = load_tensors(models / FITTED)
             build_model = partial(ItemRewardModel, record.sizes)
@@ -121,6 +125,7 @@ class TrainedPolicy:
             reward_model,
             TrainingCounts.load(folder / COUNTS) if (folder / COUNTS).exists() else None,
             load_session_end(models, reward_model),
+            Offers.load(folder / OFFERS, record.sizes["items"]) if offers.exists() else None,
         )
         trained._require_equal_sizes()
         return trained

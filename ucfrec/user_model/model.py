@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Shown
 from ucfrec.errors import damage_explained
@@ -23,6 +24,7 @@ from ucfrec.user_model.reward_fit import (
     fit_training_users,
 )
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
+from ucfrec.user_model.running import RunningRates
 from ucfrec.user_model.session_end import (
     SESSIONS,
     LoggedEnds,
@@ -108,6 +110,8 @@ class UserModel:
                 "fatigue": fatigue and asdict(fatigue),
             }
             save_tensors(path, dict(end.tensors), fitted)
+        for model in (reward, *([users[0]] if users else [])):
+            model.rates = RunningRates.of(train, model.target)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
@@ -135,10 +139,11 @@ class UserModel:
         history: Shown,
         users: Tensor | None,
         items: Tensor,
+        offer: Offer | None = None,
     ) -> Float64Array:
         """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
         slope, intercept = self.calibration
-        scores = self.rewarding.score(states, history, users, items)
+        scores = self.rewarding.score(states, history, users, items, offer)
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
         if self.fatigue is None:
             return rewards
@@ -227,6 +232,12 @@ class UserSimulator:
         values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
         return np.asarray(values, dtype=np.float32)
 
+    @property
+    def offer(self) -> Offer | None:
+        """What is on offer at the next step, at the time of the logged one; None for everything."""
+        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
+        return self._store.offer(self._episodes, steps)
+
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
         """Show one item (M,) in every session: rewards (M,), and positions of those that go on."""
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
@@ -234,7 +245,7 @@ class UserSimulator:
         states = self._sessions.latest_states(self._store.item_states, observations)
         history, users = self._sessions.shown.latest(self._lags), self._sessions.users
         steps = self._sessions.steps.numpy()
-        expected = self._model.expect(states, history, users, items)
+        expected = self._model.expect(states, history, users, items, self.offer)
         rewards = self._logged.draw(expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
         self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))

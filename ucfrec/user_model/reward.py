@@ -8,7 +8,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.windows import Shown
+from ucfrec.user_model.running import AGES, RunningRates
 
 MEMORY: Final = 50
 """Steps of a session that show tastes, the latest ones."""
@@ -157,6 +159,11 @@ class ItemRewardModel(nn.Module):
         self.reward_high = nn.Buffer(torch.ones(()))
         self.reward_std = nn.Buffer(torch.ones(()))
         self.state_std = nn.Buffer(torch.ones(state))
+        # Where items come and go: the effects of what they earned until a time, and of their age.
+        self.running = nn.Buffer(torch.zeros(sizes.get("running", 0)))
+        self.latest = nn.Buffer(torch.zeros(max(0, len(self.running) - AGES), items))
+        self.rates: RunningRates | None = None
+        """As of every time of a store; None for the `latest`."""
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
 
@@ -164,6 +171,16 @@ class ItemRewardModel(nn.Module):
     def reach(self) -> int:
         """Items shown before a step that its expected reward depends on."""
         return max(self.lags, MEMORY) if self.tastes.are_known else self.lags
+
+    def sum_running(self, offer: Offer | None, items: Tensor | None = None) -> Tensor:
+        """What the running rates and ages add at M decisions: (M,) of one item (M,) each, or
+        (M, n_items); 0 where items are always available."""
+        if offer is None or not len(self.running):
+            return torch.zeros(())
+        rates = self.rates or RunningRates(0, 1, self.latest.unsqueeze(0))
+        if items is None:
+            return rates.sum_all(offer, self.running)
+        return rates.inputs(offer, items) @ self.running
 
     def scores(
         self,
@@ -193,10 +210,13 @@ class ItemRewardModel(nn.Module):
         history: Shown,
         users: Tensor | None,
         items: Tensor,
+        offer: Offer | None = None,
     ) -> Tensor:
-        """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
+        """Linear predictors (B,) of one item each, int64 (B,), at the times of `offer`; see
+        `scores`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
+        added = added + self.sum_running(offer, items)
         return self.score_without_state(history, users, items) + x @ self.state + added
 
     def score_without_state(
@@ -257,7 +277,7 @@ class ItemRewardModel(nn.Module):
     ) -> None:
         """Set the fitted effects, those of `EFFECTS` by name; missing ones become 0, and effects of
         content those (n_items,) of the items' tags and embeddings."""
-        for name in ("user", "affinity", "state", "interaction", "exposure"):
+        for name in ("user", "affinity", "state", "interaction", "exposure", "running"):
             buffer = self.get_buffer(name)
             buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
         if "context" in effects:

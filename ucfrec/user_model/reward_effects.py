@@ -19,7 +19,7 @@ from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_o
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
 EFFECTS: Final = (
-    *("item", "user", "content", "affinity", "tastes", "exposure"),
+    *("running", "item", "user", "content", "affinity", "tastes", "exposure"),
     *("context", "state", "interaction"),
 )
 """In the order in which they are added to the model."""
@@ -44,9 +44,9 @@ _LEAST_KNOWN = 0.1
 """Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
-LASTING: Final = ("item", "user", "content", "affinity")
+LASTING: Final = ("running", "item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
-_ITEMS = ("item", "content")
+_ITEMS = ("running", "item", "content")
 """Effects of items alone."""
 _ROWS = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
@@ -81,6 +81,8 @@ class Design:
     binary: bool
     weights: Tensor
     """(M,) how many rows each row counts for."""
+    running: Tensor
+    """(M, R) inputs of `RunningRates`; R is 0 where items are always available."""
     tastes: Tensor
     """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
@@ -114,6 +116,9 @@ class Design:
             n_users=last,
             binary=bool(model.binary),
             weights=torch.ones(len(rows)) if weights is None else weights,
+            running=torch.zeros(len(rows), 0)
+            if rows.offer is None or model.rates is None
+            else model.rates.inputs(rows.offer, rows.items),
             tastes=torch.zeros(len(rows)),
         )
 
@@ -138,6 +143,7 @@ class Design:
             "content": (self.n_tags + dim,),
             "affinity": (self.n_users + 1, dim),
             "exposure": (self.exposure.shape[1],),
+            "running": (self.running.shape[1],),
             "state": (state,),
             "interaction": (state, dim),
             "context": (self.observed.shape[1], dim),
@@ -152,6 +158,7 @@ class Design:
             "user": lambda numbers: numbers[self.users],
             "tastes": lambda number: self.tastes * number,
             "exposure": self.exposure.matmul,
+            "running": self.running.matmul,
             "state": self.x.matmul,
             "affinity": lambda rows: (F.embedding(self.users, rows) * self.rows).sum(1),
             "interaction": lambda matrix: ((self.x @ matrix) * self.rows).sum(1),
@@ -188,13 +195,14 @@ class Design:
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
-            case "exposure" | "state":
+            case "exposure" | "state" | "running":
                 return (weight * self.inputs(name).square()).sum(0)
         return self.inputs(name).square().T @ vectors
 
     def inputs(self, name: str) -> Tensor:
         """The inputs (M, …) that the effect `name` multiplies, the same for all items of a row."""
-        return {"exposure": self.exposure, "context": self.observed}.get(name, self.x)
+        shared = {"exposure": self.exposure, "running": self.running, "context": self.observed}
+        return shared.get(name, self.x)
 
     @property
     def count(self) -> float:
@@ -306,7 +314,7 @@ def _scale(
     penalty: float,
 ) -> tuple[_Map, _Map]:
     """Maps of an effect to units in which the objective is about evenly curved, and back."""
-    if name in ("state", "exposure"):
+    if name in ("state", "exposure", "running"):
         factor, inverse = _factors(curvature * _moments(design, design.inputs(name)), penalty)
         return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):

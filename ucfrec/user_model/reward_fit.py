@@ -15,7 +15,7 @@ import numpy as np
 import pydantic
 import torch
 
-from ucfrec.episodes.states import ItemStates
+from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
 from ucfrec.errors import InputError, damage_explained
@@ -40,6 +40,7 @@ from ucfrec.user_model.reward_report import (
     fit_line,
     weigh_by_propensity,
 )
+from ucfrec.user_model.running import AGES, HALF_LIVES, RunningRates
 
 _Report = TypeVar("_Report")
 _USERS_FITTED = "training_users.safetensors"
@@ -68,6 +69,8 @@ def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
     states = store.item_states
     items, dim = states.embeddings.shape
     sizes = {"state": store.state_size, "action": dim, "items": items}
+    if store.has_offers:
+        sizes["running"] = len(HALF_LIVES) + AGES
     return {**sizes, "users": len(states.user_features), "tags": states.tags.shape[1]}
 
 
@@ -101,7 +104,7 @@ def fit_item_reward_model(
     if file.exists():
         return model, _read_fit(file, model, ItemRewardReport)
     rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
-    set_statistics(model, rows, held_out, train.item_states)
+    set_statistics(model, rows, held_out, train)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
@@ -149,7 +152,7 @@ def refit_item_reward_model(
     model = ItemRewardModel(reward_model_sizes(store))
     lags = MEMORY if "tastes" in report.kept else model.lags
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
-    set_statistics(model, rows, rows, store.item_states)
+    set_statistics(model, rows, rows, store)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
@@ -181,7 +184,7 @@ def fit_training_users(
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
-    set_statistics(model, rows, rows, states)
+    set_statistics(model, rows, rows, train)
     # What the session shows of tastes is known already: states are features and observations.
     model.state_std[: states.size - states.user_features.shape[1]] = torch.inf
     if weighted:
@@ -212,9 +215,11 @@ def set_statistics(
     model: ItemRewardModel,
     rows: RewardRows,
     held_out: RewardRows,
-    states: ItemStates,
+    train: EpisodeStore,
 ) -> None:
-    """Set the normalisation of states, rewards and embeddings from the training rows."""
+    """Set the normalisation of states, rewards and embeddings from the training rows, and the
+    running rates of items that come and go."""
+    states = train.item_states
     for name, part in (("training", rows), ("held-out", held_out)):
         if len(part) == 0:
             raise InputError(f"the reward model has no {name} steps; check the store's split")
@@ -242,6 +247,10 @@ def set_statistics(
     length = exact[rows.items].square_().sum(1).mean().sqrt()
     model.vectors.copy_(exact.div_(length.clamp(min=_CONSTANT)))
     model.likeness.start_from(states)
+    model.rates = RunningRates.of(train, model.target)
+    if model.rates is not None:
+        last = torch.tensor([train.column(schema.TIMESTAMP).max()])
+        model.latest.copy_(model.rates.rates[model.rates.rows(last)[0]])
 
 
 def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]) -> _Report:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
 from ucfrec.results.statistics import ratio_with_error
@@ -44,6 +46,8 @@ class RewardRows:
     """(M,) float32, in reward units."""
     observations: int
     """O, the last numbers of the states: what was observed beside the session itself."""
+    offer: Offer | None = None
+    """What was on offer; None for everything."""
 
     def __len__(self) -> int:
         return len(self.items)
@@ -83,6 +87,7 @@ class RewardRows:
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
+            view.offer(episodes, steps),
         )
 
 
@@ -190,6 +195,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.history.at(part),
             rows.users[part],
             rows.items[part],
+            rows.offer and rows.offer.change(itemgetter(part)),
         )
         for part in torch.split(torch.arange(len(rows)), _CHUNK)
     ]

@@ -12,14 +12,16 @@ SessionBy: TypeAlias = Literal["session_id", "gap", "user"]
 """How rows form sessions: by a column, by a pause of the user, or one session per user."""
 PROPENSITY: Final = "propensity"
 IS_RANDOM: Final = "is_random"
+REQUEST_ID: Final = "request_id"
+"""Rows of one request are one decision; without it, those of a user at one time."""
+POSITION: Final = "position"
+"""Place of an item in the list of its decision, in any numbers that ascend."""
 ACTION: Final = "action"
 """A list of floats, in logs whose actions are vectors instead of items."""
 OBSERVATION: Final = "observation"
 """A list of floats: what was observed just before the action."""
 
 # Columns of exposures, one row per item shown, besides those of logs.
-REQUEST_ID: Final = "request_id"
-POSITION: Final = "position"
 RUN: Final = "run"
 """Fingerprint of the run."""
 RULE: Final = "rule"
@@ -31,6 +33,8 @@ ARM: Final = "arm"
 ITEM: Final = "item"
 REWARD: Final = "reward"
 RETURN_TO_GO: Final = "return_to_go"
+PLACE: Final = "place"
+"""Place of the row in its decision, from 0; stores of decisions of one row each lack it."""
 
 # Episode-store columns, one row per episode.
 USER: Final = "user"
@@ -47,6 +51,7 @@ STEP_DTYPES: Final = {
     TIMESTAMP: "<i8",
     PROPENSITY: "<f4",
     IS_RANDOM: "|u1",
+    PLACE: "<i4",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 

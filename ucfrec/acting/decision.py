@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from pydantic import Field, PlainSerializer, PlainValidator
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
@@ -146,14 +147,37 @@ class DecisionRule:
             targets = returns.target_returns(self.target, collected)
         return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 
-    def log_probabilities(self, scores: Tensor) -> Tensor:
-        """Log-probabilities (nats) with which items are shown (first), (B, n_items).
+    def log_probabilities(self, scores: Tensor, earlier: Tensor | None = None) -> Tensor:
+        """Log-probabilities (nats) with which items are shown next in a list, (B, n_items).
 
         Args:
             scores: (B, n_items) of `Scorer.scores`.
+            earlier: (B, P) int64 different items at the positions before, −1 for none; None for
+                those of a first position.
         """
-        first, *second = (logs.add_(math.log(share)) for share, logs in self._modes(scores))
-        return torch.logaddexp(first, second[0]) if second else first
+        modes = self._modes(scores)
+        if earlier is None or not earlier.shape[1]:
+            first, *second = (logs.add_(math.log(share)) for share, logs in modes)
+            return torch.logaddexp(first, second[0]) if second else first
+        positions, totals = torch.where(earlier < 0, scores.shape[1], earlier), []
+        for share, logs in self._follow_best(modes, scores):
+            # A further item that is never drawn stands for none.
+            logs = F.pad(logs, (0, 1), value=-torch.inf)
+            before = _conditional(logs, positions).masked_fill(earlier < 0, 0.0).sum(1)
+            left = logs.scatter(1, positions, -torch.inf)[:, :-1].log_softmax(1)
+            totals.append(
+                math.log(share) + before.unsqueeze(1) + torch.nan_to_num(left, nan=-torch.inf)
+            )
+        joint = torch.stack(totals).logsumexp(0)
+        return torch.nan_to_num(joint - joint.logsumexp(1, keepdim=True), nan=-torch.inf).float()
+
+    def _follow_best(
+        self, modes: list[tuple[float, Tensor]], scores: Tensor
+    ) -> list[tuple[float, Tensor]]:
+        """The modes in float64; once no item is left that they draw, the others follow by score."""
+        ranks = scores.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
+        last = _LAST * (1.0 + ranks.double())
+        return [(share, logs.double().maximum(last)) for share, logs in modes]
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Items (B,) and the probabilities (B,) with which they were chosen.
@@ -189,9 +213,7 @@ class DecisionRule:
         assert uniforms is not None
         modes = self._modes(scores)
         if len(modes) > 1 or int((modes[0][1] > -torch.inf).sum(1).min()) < k:
-            ranks = scores.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
-            last = _LAST * (1.0 + ranks.double())
-            modes = [(share, logs.double().maximum(last)) for share, logs in modes]
+            modes = self._follow_best(modes, scores)
         logs = modes[0][1].double()
         if len(modes) > 1:
             logs = torch.where(uniforms[:, -1:] < self.explore, modes[1][1], logs)

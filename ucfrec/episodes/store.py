@@ -332,7 +332,7 @@ class UserRows:
         """Values of a step column at sources of any shape; see `source`."""
         later, earlier = self.later, self.earlier
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
-        if earlier is not None and (source < 0).any():
+        if earlier is not None and (source < 0).any() and name in earlier.record.columns:
             steps = earlier.locate(-1 - source[source < 0])
             values[source < 0] = earlier.step_values(name, *steps)
         return values
@@ -340,7 +340,7 @@ class UserRows:
     def recent(self, steps: IntArray, count: int) -> tuple[IntArray, Float32Array]:
         """The items and rewards (B, count) of the user's latest rows before later steps (B,),
         most recent first; −1 and 0 where there are fewer."""
-        rows = self.place[steps][:, None] - np.arange(1, count + 1)
+        rows = self.place[self._starts(steps)][:, None] - np.arange(1, count + 1)
         missing = rows < self.first[steps][:, None]
         source = self.source[np.maximum(rows, 0)]
         items = np.where(missing, -1, self.values(schema.ITEM, source)).astype(np.int64)
@@ -351,10 +351,15 @@ class UserRows:
         """(rows, items), each (M,): the known items in all rows of the user before later steps
         (B,); `rows` are indices into the B."""
         first = self.first[steps]
-        owner, inside = list_earlier(self.place[steps] - first)
+        owner, inside = list_earlier(self.place[self._starts(steps)] - first)
         source = self.source[first[owner] + inside]
         items = self.values(schema.ITEM, source).astype(np.int64)
         return owner[items >= 0], items[items >= 0]
+
+    def _starts(self, steps: IntArray) -> IntArray:
+        """The first rows (B,) of the decisions that later steps (B,) belong to."""
+        episodes, numbers = self.later.locate(steps)
+        return steps - (numbers - self.later.decision_starts(episodes, numbers))
 
     def continue_sessions(self, gap_ms: float | None) -> EpisodeStore:
         """The later log, with the rows before it in the sessions that go on in it; a pause of more

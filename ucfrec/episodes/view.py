@@ -412,6 +412,26 @@ class EpisodeView:
         """Actions as vectors (..., A): the embeddings of items (...); vectors are unchanged."""
         return self.item_states.embeddings[actions] if self.has_items else actions
 
+    def decision_starts(self, episodes: IntArray, steps: IntArray) -> IntArray:
+        """First rows of the decisions that steps of episodes, of equal shapes, belong to."""
+        if schema.PLACE not in self.record.columns:
+            return steps
+        # A split may cut a decision whose rows have several times.
+        return np.maximum(steps - self.step_values(schema.PLACE, episodes, steps), 0)
+
+    def decision_ends(self, episodes: IntArray, steps: IntArray) -> IntArray:
+        """The steps (M,) after the decisions that steps (M,) of episodes (M,) belong to."""
+        ends = steps + 1
+        if schema.PLACE not in self.record.columns:
+            return ends
+        inside = np.flatnonzero(ends < self.lengths[episodes])
+        while len(inside):
+            places = self.step_values(schema.PLACE, episodes[inside], ends[inside])
+            inside = inside[places > 0]
+            ends[inside] += 1
+            inside = inside[ends[inside] < self.lengths[episodes[inside]]]
+        return ends
+
     def windows(
         self,
         episodes: IntArray,
@@ -419,6 +439,9 @@ class EpisodeView:
         length: int,
     ) -> Windows:
         """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
+
+        Of a decision with several rows, the rows before that step are left out: the last column is
+        the decision, with the step's own action and reward, after the steps before the decision.
 
         Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
         [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
@@ -432,25 +455,33 @@ class EpisodeView:
             InputError: an episode or step does not exist, or the arguments have other shapes.
         """
         self._require_steps(episodes, ends, length)
-        steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
+        starts = self.decision_starts(episodes, ends)
+        steps = starts[:, None] + np.arange(1 - length, 1)  # (B, K)
         action = schema.ITEM if self.has_items else schema.ACTION
         numbers, columns = self.episode_ids[episodes], self._columns
         index = columns.starts[numbers][:, None] + np.maximum(steps, 0)
-        actions, rewards, returns = (
+        returns = torch.from_numpy(columns.step_column(schema.RETURN_TO_GO).take(index))
+        states, decides = columns.states(numbers, steps), None
+        if schema.PLACE in self.record.columns:
+            places = columns.step_column(schema.PLACE).take(index)
+            places[:, -1] = 0
+            decides = torch.from_numpy(places == 0)
+            index[:, -1] += ends - starts
+        actions, rewards = (
             torch.from_numpy(columns.step_column(name).take(index))
-            for name in (action, schema.REWARD, schema.RETURN_TO_GO)
+            for name in (action, schema.REWARD)
         )
         if self.has_items:
             actions = actions.long()
-        states = columns.states(numbers, steps)
         windows = Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
-        return replace(windows, offer=self.offer(episodes[:, None], steps.clip(min=0)))
+        offer = self.offer(episodes[:, None], steps.clip(min=0))
+        return replace(windows, offer=offer, decides=decides)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
         """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""
-        window = self.windows(episodes, steps, 1)
-        last = steps == self.lengths[episodes] - 1
-        next_steps = np.where(last, steps, steps + 1)
+        window, ends = self.windows(episodes, steps, 1), self.decision_ends(episodes, steps)
+        last = ends == self.lengths[episodes]
+        next_steps = np.where(last, steps, ends)
         next_states = self._columns.states(self.episode_ids[episodes], next_steps[:, None])[:, 0]
         is_last = torch.from_numpy(last)
         return Transitions(

@@ -64,6 +64,13 @@ class Windows(_Rows):
     """(B, K) bool, true at steps of the episode, false at padding."""
     offer: Offer | None = None
     """What was on offer at each of the (B, K) steps; None for everything."""
+    decides: Tensor | None = None
+    """(B, K) bool, false where a step is a later row of a decision with several; None for true."""
+
+    @property
+    def decided(self) -> Tensor:
+        """(B, K) bool, the steps whose actions are predicted: first rows of decisions."""
+        return self.mask if self.decides is None else self.mask & self.decides
 
     def __repr__(self) -> str:
         (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
@@ -305,24 +312,26 @@ class Sessions(_Rows):
         context: int,
         length: int,
     ) -> "Sessions":
-        """What was known before steps (B,) of sessions (B,) of a store of items.
+        """What was known before steps (B,) of sessions (B,) of a store of items: before the first
+        rows of their decisions.
 
         The store has the training's items. An item −1 is unknown; any known item can replace it,
         because steps after it have weight 0 in all estimates. At most `context` = K states are
         read, and `length` = L items, or as many as the context has.
         """
-        context = min(context, int(steps.max(initial=0)) + 1)
-        recent = Shown.before(store, episodes, steps, max(length, context - 1))
+        starts = store.decision_starts(episodes, steps)
+        context = min(context, int(starts.max(initial=0)) + 1)
+        recent = Shown.before(store, episodes, starts, max(length, context - 1))
         users = np.full(len(steps), -1)
         if store.has_users:
             users = store.episode_values(schema.USER).astype(np.int64)[episodes]
         return cls(
             recent.items.flip(1),
             recent.rewards.flip(1),
-            torch.from_numpy(steps),
-            torch.from_numpy(store.rewards_before(episodes, steps)),
+            torch.from_numpy(starts),
+            torch.from_numpy(store.rewards_before(episodes, starts)),
             torch.from_numpy(users),
-            states=store.windows(episodes, steps, context).states,
+            states=store.windows(episodes, starts, context).states,
             offer=store.offer(episodes, steps),
         )
 
@@ -539,7 +548,8 @@ class TrainingEpisodes:
     ) -> Windows:
         """Windows as `EpisodeStore.windows`; those of action copies end with their last step."""
         windows, augmented = self._sources.windows(episodes, ends, length), self._augmented
-        steps = ends[:, None] + np.arange(1 - length, 1)
+        starts = self._sources.decision_starts(episodes, ends)
+        steps = starts[:, None] + np.arange(1 - length, 1)
         copies = episodes[:, None] - self._n_logged
         possible = (copies >= 0) & (steps >= 0) & (steps < self._stride)
         keys = np.where(possible, copies * self._stride + steps, -1)

@@ -36,7 +36,7 @@ from ucfrec.processes import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
-_FILL = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
+_FILL = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0, schema.PLACE: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
 _DENSER = 20
 _LATEST = 210_000
@@ -311,7 +311,8 @@ def _write(
 
     typed = log.rows.log
     left = [shard for shard in shards if shard.stays.any()]
-    added = [name for name in _FILL if name in typed.columns and name not in old.columns]
+    has = {*typed.columns, *([schema.PLACE] if log.rows.has_lists else [])}
+    added = [name for name in _FILL if name in has and name not in old.columns]
     if schema.OBSERVATION in old.columns and schema.OBSERVATION not in typed.columns:
         raise InputError(
             f"{typed.name} has no observation, {store} has; name its column with --column"

@@ -49,7 +49,10 @@ _CLOSED = {
     # Otherwise SQL could read any Python variable as a table.
     "python_enable_replacements": False,
 }
-_OF_JOIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.PROPENSITY)
+_OF_JOIN = (
+    *(schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP),
+    *(schema.REQUEST_ID, schema.POSITION, schema.PROPENSITY),
+)
 """Log columns that logs of `join` have."""
 _NAME = re.compile(r"[^\W\d]\w*")
 _OF_ENGINE = re.compile(r"[A-Z][A-Za-z ]+ Error: ")

@@ -13,7 +13,7 @@ from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
-from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -302,7 +302,7 @@ def _feedback_columns(
 
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
-    absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
+    absent = dict.fromkeys(OPTIONAL_COLUMNS, "")
     return replace(mapping, columns={**mapping.columns, **absent})
 
 

@@ -30,6 +30,8 @@ OPTIONAL_COLUMNS: Final = (
     schema.PROPENSITY,
     schema.SESSION_ID,
     schema.IS_RANDOM,
+    schema.REQUEST_ID,
+    schema.POSITION,
 )
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""

@@ -30,6 +30,8 @@ from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
 
 USER, ITEM, SESSION = "user_code", "item_code", "session"
 """Columns of the sorted rows: numbers of the ids, in the order of the ids."""
+_REQUEST = "request"
+"""Column of a hash of the request."""
 CODES: Final = {
     schema.USER_ID: ("user_codes", USER),
     schema.ITEM_ID: ("item_codes", ITEM),
@@ -134,7 +136,8 @@ class SortedRows:
     file: RowFile
     """The rows in order of user and time, all of a user in one batch: `USER`, `ITEM` or `action`,
     `timestamp`, `reward` (float64), `row` (position in the files) and, if the log has them,
-    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown) and `is_random`."""
+    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown) and `is_random`; and
+    `place`, in the row's decision."""
     observations: RowVectors | None
     dropped: dict[str, int]
     """Number of dropped rows by reason."""
@@ -145,6 +148,8 @@ class SortedRows:
     """Number of duplicates with another reward than the row that counts."""
     tied: int = 0
     """Number of rows that share their user and time."""
+    has_lists: bool = False
+    """Whether some decision has several rows."""
     unsorted: int = 0
     """Number of rows that are in the files before the row that precedes them in time."""
     first_ms: int = np.iinfo(np.int64).max
@@ -193,6 +198,11 @@ class SortedRows:
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
+        listed = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
+        if listed:
+            order = np.lexsort([*listed, times, batch[USER]])
+            batch = {name: values[order] for name, values in batch.items()}
+            times = batch[schema.TIMESTAMP]
         if by_session:
             users, sessions = batch[USER], batch[SESSION]
             # Sessions are in the order of their first times.
@@ -200,6 +210,8 @@ class SortedRows:
             _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
             order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
+        batch[schema.PLACE] = places = _find_places(batch)
+        self.has_lists |= bool(places.any())
         self.file.append(batch)
 
     def _put_winners_first(
@@ -218,6 +230,20 @@ class SortedRows:
         source = np.arange(len(repeated))
         source[places] = order
         return {name: values[source] for name, values in batch.items()}
+
+
+def _find_places(batch: dict[str, Array]) -> IntArray:
+    """(M,) place of each row in its decision, from 0, of rows in order, which lose their requests
+    and positions."""
+    batch.pop(schema.POSITION, None)
+    decision = batch.pop(_REQUEST, batch[schema.TIMESTAMP])
+    goes_on = _equal_before(batch[USER]) & _equal_before(decision)
+    if SESSION in batch:
+        goes_on &= _equal_before(batch[SESSION])
+    rows = np.arange(len(decision))
+    return (rows - np.maximum.accumulate(np.where(np.append(False, goes_on), 0, rows))).astype(
+        "<i4"
+    )
 
 
 def _equal_before(values: Array) -> BoolArray:
@@ -349,6 +375,11 @@ def order_rows(log: TypedLog, rows: str) -> str:
     columns |= {name: name for name in (schema.ACTION, schema.IS_RANDOM) if name in log.columns}
     if schema.PROPENSITY in log.columns:
         columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
+    if schema.REQUEST_ID in log.columns:
+        # A row without a request is a decision of its own.
+        columns[_REQUEST] = f"coalesce({HASH.format(schema.REQUEST_ID)}, -row)"
+    if schema.POSITION in log.columns:
+        columns[schema.POSITION] = f"coalesce({schema.POSITION}, 0)"
     choice = ITEM if schema.ITEM_ID in tables else schema.ACTION
     values = ", ".join(f"{sql} AS {name}" for name, sql in columns.items())
     names = ", ".join(name for name in columns if name != "tie")

@@ -420,6 +420,8 @@ def write_steps(
             total += len(columns[schema.ITEM])
         if rows.observations is not None:
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
+        if not rows.has_lists:
+            del columns[schema.PLACE]
         names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
         steps = {name: columns[name] for name in names}
         count = int(lengths.sum())

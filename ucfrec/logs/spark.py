@@ -70,6 +70,7 @@ _TYPES = {
     schema.OBSERVATION: "array<float>",
     schema.PROPENSITY: "float",
     schema.IS_RANDOM: "boolean",
+    schema.POSITION: "double",
 }
 """DuckDB type of an id, or another log column, to Spark's type."""
 _SORTED = "sorted"

@@ -47,7 +47,7 @@ VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
 _BATCH_BYTES = 2**25
 _IS_INTEGER = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
 """SQL of whether a text `x` is as the integer that it means is written."""
-_IDS = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
+_IDS = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID, schema.REQUEST_ID)
 _TYPES = {
     **dict.fromkeys(_IDS, "VARCHAR"),
     schema.TIMESTAMP: "BIGINT",
@@ -55,6 +55,7 @@ _TYPES = {
     schema.OBSERVATION: "FLOAT[]",
     schema.PROPENSITY: "FLOAT",
     schema.IS_RANDOM: "BOOLEAN",
+    schema.POSITION: "DOUBLE",
 }
 _DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
 _OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
@@ -357,6 +358,10 @@ def cast_value(
             valid = f"{sql} BETWEEN -{MAX_FLOAT} AND {MAX_FLOAT}"
             return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
         remedy = "use a number above 0"
+    elif name == schema.POSITION:
+        if is_number(kind):
+            return f"CAST({sql} AS DOUBLE)", "DOUBLE"
+        remedy = "use a number"
     else:
         if is_number(kind) or kind == "BOOLEAN":
             return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"

@@ -200,31 +200,57 @@ def score_steps(
         for begin in range(0, total, at_once):
             numbers = np.arange(begin, min(begin + at_once, total))
             episodes, steps = store.locate(numbers)
-            sessions = sessions_before(scorer, store, episodes, steps)
-            earlier = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
+            # Rows of one decision share what was known, and are drawn one after the other.
+            starts = store.decision_starts(episodes, steps)
+            begins = np.append(True, (np.diff(episodes) != 0) | (np.diff(starts) != 0))
+            first, decision = np.flatnonzero(begins), np.cumsum(begins) - 1
+            at = episodes[first], starts[first]
+            sessions = sessions_before(scorer, store, *at)
+            earlier = seen_before(store, *at) if scorer.rule.exclude_seen else None
             windows = scorer.windows(sessions)
             query = scorer.query(sessions, windows)
             excluded = None
             if seen is not None:
-                rows, seen_items = seen.seen(numbers)
+                rows, seen_items = seen.seen(numbers[first])
                 pairs = np.unique((rows * n_items + seen_items)[seen_items < n_items])
                 rows, seen_items = np.divmod(pairs, n_items)
                 # A step that would have no item left excludes none.
-                left = np.bincount(rows, minlength=len(numbers))[rows] < n_items
+                left = np.bincount(rows, minlength=len(first))[rows] < n_items
                 excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
             scores = scorer.scores_of(query, excluded, earlier)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+            of_list = _list_positions(store, episodes, starts, steps)
+            if of_list.shape[1]:
+                scores, shared = scores[decision], torch.from_numpy(decision)
+            else:
+                shared = torch.arange(len(first))
+            log_probabilities = scorer.rule.log_probabilities(scores, of_list)
+            row, place = torch.nonzero(of_list >= 0, as_tuple=True)
+            scores[row, of_list[row, place]] = -torch.inf
             yield ScoredSteps(
                 episodes,
                 steps,
                 torch.from_numpy(items),
-                query.states,
+                query.states[shared],
                 scores,
-                scorer.rule.log_probabilities(scores),
-                windows.returns_to_go[:, -1],
-                query.features,
+                log_probabilities,
+                windows.returns_to_go[shared, -1],
+                None if query.features is None else query.features[shared],
             )
             bar.update(len(steps))
+
+
+def _list_positions(
+    store: EpisodeStore,
+    episodes: IntArray,
+    starts: IntArray,
+    steps: IntArray,
+) -> Tensor:
+    """(B, P) int64 known items at the positions before steps (B,) in decisions that begin with
+    `starts` (B,); −1 where there are fewer."""
+    places = starts[:, None] + np.arange(int((steps - starts).max(initial=0)))
+    items = store.step_values(schema.ITEM, episodes[:, None], places.clip(max=steps[:, None]))
+    return torch.from_numpy(np.where(places < steps[:, None], items, -1).astype(np.int64))
 
 
 def score(

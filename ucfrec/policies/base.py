@@ -195,7 +195,7 @@ class SequencePolicy(nn.Module, ABC):
     def imitation(self, features: Tensor, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss over all steps of normalised windows with features (B, K, d), plus the loss
         of the state values if there are any."""
-        padded = some_padding(windows.mask)
+        padded = some_padding(windows.decided)
         exposed = self.exposed(windows, padded)
 
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)

@@ -250,8 +250,8 @@ class EDT4RecPolicy(DTPolicy):
         normalized = self.normalize(_consistent(windows))
         features = self.features(normalized)
         imitation, scalars = self.imitation(features, normalized)
-        exposed = self.exposed(normalized, windows.mask)
-        entropy = self.head.entropy(features[windows.mask], exposed)  # type: ignore[operator]
+        exposed = self.exposed(normalized, windows.decided)
+        entropy = self.head.entropy(features[windows.decided], exposed)  # type: ignore[operator]
         multiplier = self.log_multiplier.exp()
         constraint = multiplier * (entropy.detach() - self.least_entropy)
         constraint = constraint - multiplier.detach() * entropy

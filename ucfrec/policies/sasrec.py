@@ -87,7 +87,7 @@ class GSASRecPolicy(SASRecPolicy):
         head = self.head
         assert isinstance(head, ItemHead)
         normalized = self.normalize(windows)
-        valid = windows.mask
+        valid = windows.decided
         features, actions = self.features(normalized)[valid], windows.actions[valid]
         exposed = self.exposed(normalized, valid)
         n_items, negatives, device = len(head.bias), self.config.negatives, features.device

@@ -83,7 +83,7 @@ class RewardRows:
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
-            Shown.before(view, episodes, steps, lags),
+            Shown.before(view, episodes, view.decision_starts(episodes, steps), lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,

@@ -21,6 +21,12 @@ ACTION: Final = "action"
 OBSERVATION: Final = "observation"
 """A list of floats: what was observed just before the action."""
 
+SESSION_BEGAN: Final = "session_began"
+"""Time (ms) at which the session of the decision began: with sessions by gap, it says more than a
+pause between rows."""
+EXCLUDES_SEEN: Final = "excludes_seen"
+"""Whether items that the user had been shown before were not on offer."""
+
 # Columns of exposures, one row per item shown, besides those of logs.
 RUN: Final = "run"
 """Fingerprint of the run."""
@@ -52,6 +58,8 @@ STEP_DTYPES: Final = {
     PROPENSITY: "<f4",
     IS_RANDOM: "|u1",
     PLACE: "<i4",
+    SESSION_BEGAN: "<i8",
+    EXCLUDES_SEEN: "|u1",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 

@@ -332,9 +332,11 @@ class UserRows:
         """Values of a step column at sources of any shape; see `source`."""
         later, earlier = self.later, self.earlier
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
-        if earlier is not None and (source < 0).any() and name in earlier.record.columns:
-            steps = earlier.locate(-1 - source[source < 0])
-            values[source < 0] = earlier.step_values(name, *steps)
+        if earlier is not None and (source < 0).any():
+            values[source < 0] = -1 if name == schema.SESSION_BEGAN else 0
+            if name in earlier.record.columns:
+                steps = earlier.locate(-1 - source[source < 0])
+                values[source < 0] = earlier.step_values(name, *steps)
         return values
 
     def recent(self, steps: IntArray, count: int) -> tuple[IntArray, Float32Array]:
@@ -399,6 +401,9 @@ class UserRows:
         an earlier row, or the same."""
         times = self.values(schema.TIMESTAMP, self.source).astype(np.int64)
         pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
+        if gap_ms is not None and schema.SESSION_BEGAN in self.later.record.columns:
+            began = self.values(schema.SESSION_BEGAN, self.source)[1:]
+            pause = np.where(began < 0, pause, began > times[:-1])
         breaks = np.append(True, pause | (self.source[:-1] >= 0))
         breaks[self.first] = True
         starts = np.flatnonzero(breaks)

@@ -36,7 +36,11 @@ from ucfrec.processes import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
-_FILL = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0, schema.PLACE: 0}
+_FILL = {
+    schema.PROPENSITY: np.nan,
+    schema.SESSION_BEGAN: -1,
+    **dict.fromkeys((schema.IS_RANDOM, schema.PLACE, schema.EXCLUDES_SEEN), 0),
+}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
 _DENSER = 20
 _LATEST = 210_000

@@ -34,6 +34,8 @@ _OTHERS = {
     _REQUEST: "VARCHAR",
     schema.POSITION: "INTEGER",
     schema.PROPENSITY: "DOUBLE",
+    schema.SESSION_BEGAN: "BIGINT",
+    schema.EXCLUDES_SEEN: "BOOLEAN",
     schema.RUN: "VARCHAR",
     schema.RULE: "VARCHAR",
     schema.ARM: "VARCHAR",

@@ -32,6 +32,8 @@ OPTIONAL_COLUMNS: Final = (
     schema.IS_RANDOM,
     schema.REQUEST_ID,
     schema.POSITION,
+    schema.SESSION_BEGAN,
+    schema.EXCLUDES_SEEN,
 )
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""

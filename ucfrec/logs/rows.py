@@ -372,7 +372,10 @@ def order_rows(log: TypedLog, rows: str) -> str:
     }
     if schema.SESSION_ID in tables:
         columns[SESSION] = f"coalesce({columns[SESSION]}, {2**31 - 1})"
-    columns |= {name: name for name in (schema.ACTION, schema.IS_RANDOM) if name in log.columns}
+    whole = (schema.ACTION, schema.IS_RANDOM, schema.EXCLUDES_SEEN)
+    columns |= {name: name for name in whole if name in log.columns}
+    if schema.SESSION_BEGAN in log.columns:
+        columns[schema.SESSION_BEGAN] = f"coalesce({schema.SESSION_BEGAN}, -1)"
     if schema.PROPENSITY in log.columns:
         columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
     if schema.REQUEST_ID in log.columns:

@@ -114,7 +114,11 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         user_ends = np.append(users[1:] != users[:-1], True)
         ends, last_ends = user_ends, np.full(len(users), cut.session_by == schema.SESSION_ID)
         if cut.session_by == "gap":
-            ends = user_ends | np.append(times[1:] - times[:-1] > cut.gap_ms, True)
+            pause = times[1:] - times[:-1] > cut.gap_ms
+            if schema.SESSION_BEGAN in batch:
+                began = batch[schema.SESSION_BEGAN][1:]
+                pause = np.where(began < 0, pause, began > times[:-1])
+            ends = user_ends | np.append(pause, True)
             last_ends = rows.last_ms - times > cut.gap_ms
         elif cut.session_by == schema.SESSION_ID:
             ends = user_ends | np.append(batch[SESSION][1:] != batch[SESSION][:-1], True)

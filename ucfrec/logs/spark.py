@@ -71,6 +71,8 @@ _TYPES = {
     schema.PROPENSITY: "float",
     schema.IS_RANDOM: "boolean",
     schema.POSITION: "double",
+    schema.SESSION_BEGAN: "bigint",
+    schema.EXCLUDES_SEEN: "boolean",
 }
 """DuckDB type of an id, or another log column, to Spark's type."""
 _SORTED = "sorted"

@@ -56,6 +56,8 @@ _TYPES = {
     schema.PROPENSITY: "FLOAT",
     schema.IS_RANDOM: "BOOLEAN",
     schema.POSITION: "DOUBLE",
+    schema.SESSION_BEGAN: "BIGINT",
+    schema.EXCLUDES_SEEN: "BOOLEAN",
 }
 _DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
 _OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
@@ -314,7 +316,7 @@ def cast_value(
 ) -> tuple[str, str]:
     """SQL that casts a column to its type in the schema, and that DuckDB type."""
     sql, kind = bound.sql, bound.kind
-    nothing = "false" if name == schema.IS_RANDOM else f"CAST(NULL AS {_TYPES[name]})"
+    nothing = "false" if _TYPES[name] == "BOOLEAN" else f"CAST(NULL AS {_TYPES[name]})"
     if kind == NOTHING:
         return nothing, NOTHING
     # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
@@ -338,7 +340,7 @@ def cast_value(
         remedy = f"use integers or text, e.g. --column {name}='({expression})::BIGINT'"
         if is_number(kind):
             remedy += ", if all are whole numbers of at most 15 digits: others would be rounded"
-    elif name == schema.TIMESTAMP:
+    elif name in (schema.TIMESTAMP, schema.SESSION_BEGAN):
         if is_number(kind) and time_format is None:
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
         if is_number(kind):

@@ -11,6 +11,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,7 +20,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
-from ucfrec.recommending.recommend import RANK
+from ucfrec.recommending.recommend import RANK, read_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             schema.REQUEST_ID: pa.string(),
             schema.POSITION: pa.int32(),
             schema.PROPENSITY: pa.float64(),
+            schema.SESSION_BEGAN: pa.int64(),
+            schema.EXCLUDES_SEEN: pa.bool_(),
             schema.RUN: pa.string(),
             schema.RULE: pa.string(),
             schema.ARM: pa.string(),
@@ -55,16 +58,32 @@ def exposures_written(
     trained: TrainedPolicy,
     rule: str,
     frames: Iterable[pd.DataFrame],
+    *,
+    excludes_seen: bool,
+    at: str | float | None = None,
 ) -> Iterator[Iterator[pd.DataFrame]]:
-    """Yield the same frames of `recommend`, also written to a file, whole once the block ends."""
-    columns, now = exposure_schema(trained), int(time.time() * 1000)
-    constants: dict[str, str | int] = {
-        schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
-    }  # fmt: skip
+    """Yield the same frames of `recommend`, also written to a file, whole once the block ends.
+
+    Requests are a millisecond apart, from the time `at` on, or from now, so that a split by time
+    can part them.
+    """
+    columns, begin = exposure_schema(trained), read_time(at) or int(time.time() * 1000)
+    constants: dict[str, str | bool] = {
+        schema.RUN: trained.fingerprint,
+        schema.RULE: rule,
+        schema.ARM: "",
+        schema.EXCLUDES_SEEN: excludes_seen,
+    }
 
     def write_all() -> Iterator[pd.DataFrame]:
+        first = begin
         for frame in frames:
             exposures = frame.rename(columns={RANK: schema.POSITION}).assign(**constants)
+            times = first + exposures[schema.USER_ID].factorize()[0]
+            began = frame.attrs[schema.SESSION_BEGAN]
+            exposures[schema.TIMESTAMP] = times
+            exposures[schema.SESSION_BEGAN] = np.where(began < 0, times, began)
+            first = int(times.max(initial=first - 1)) + 1
             exposures[schema.USER_ID] = exposures[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(exposures[columns.names], columns, preserve_index=False)
             writer.write_table(table)
@@ -165,7 +184,11 @@ class ExposureLog:
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
         rows = [
-            (user, item, now, answer.request_id, position, chance, *answer[4:])  # run, rule, arm
+            (
+                *(user, item, now, answer.request_id, position, chance),
+                now if answer.session_began < 0 else answer.session_began,
+                *(answer.excludes_seen, answer.run, answer.rule, answer.arm),
+            )
             for user, now, answer in waiting
             for position, (item, chance) in enumerate(
                 zip(answer.items, answer.propensities, strict=True), 1

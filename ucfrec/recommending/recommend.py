@@ -97,7 +97,7 @@ def recommend(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    chooser = Chooser(trained, trained.item_scorer(rule), seed, index, _read_time(at))
+    chooser = Chooser(trained, trained.item_scorer(rule), seed, index, read_time(at))
     k, excluded, remaining = require_whole("k", k), None, iter(batches)
     if candidates is not None:
         ids = require_ids("candidates", candidates, schema.ITEM_ID)
@@ -115,9 +115,9 @@ def recommend(
         np.maximum.at(last, batch.owner, batch.timestamps)
         requests = np.asarray([f"{seed}-{time}" for time in last.tolist()], dtype=object)
         new = np.full(len(histories.users), new_session)
-        items, scores, propensities = chooser.choose(histories, requests, k, new, excluded)
+        items, scores, propensities, began = chooser.choose(histories, requests, k, new, excluded)
         left = np.isfinite(scores)
-        return pd.DataFrame(
+        frame = pd.DataFrame(
             {
                 schema.USER_ID: np.repeat(histories.users, left.sum(1)),
                 RANK: np.cumsum(left, axis=1)[left],
@@ -127,6 +127,8 @@ def recommend(
                 schema.REQUEST_ID: np.repeat(requests, left.sum(1)),
             }
         )
+        frame.attrs[schema.SESSION_BEGAN] = np.repeat(began, left.sum(1))
+        return frame
 
     return map(to_frame, remaining)
 
@@ -144,7 +146,8 @@ def _require_available(trained: TrainedPolicy, time: Tensor, excluded: Tensor | 
         )
 
 
-def _read_time(at: str | float | None) -> int | None:
+def read_time(at: str | float | None) -> int | None:
+    """Milliseconds since 1970 of the time of requests; InputError if it is no time."""
     try:
         return None if at is None else round(parse_time(at))
     except ValueError as error:
@@ -174,9 +177,9 @@ class Chooser:
         new: BoolArray,
         excluded: Tensor | None = None,
         candidates: Sequence[IntArray | None] = (),
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, IntArray]:
         """Items (U, k) in the order shown, their log-probabilities at temperature 1, −∞ where no
-        more may be shown, and their propensities.
+        more may be shown, their propensities, and when the sessions (U,) began, ms, −1 for now.
 
         Args:
             histories: of U users, of `with_numbers`; what they have seen is not recommended.
@@ -210,7 +213,10 @@ class Chooser:
         items, scores, propensities = (
             np.concatenate(arrays)[back] for arrays in zip(*parts, strict=True)
         )
-        return items, scores, propensities
+        began = np.full(len(new), -1)
+        starts = np.flatnonzero(np.diff(latest.owner, prepend=-1))
+        began[latest.owner[starts]] = latest.timestamps[starts]
+        return items, scores, propensities, began
 
     def _choose_together(
         self,

@@ -49,6 +49,10 @@ class Answer(NamedTuple):
     """Hash of the decision rule."""
     arm: str = ""
     """Run of the user's arm, where runs share the users."""
+    session_began: int = -1
+    """Time of the session's first row, ms; −1 for the time of the answer."""
+    excludes_seen: bool = False
+    """Whether items of the history could not be shown."""
 
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
@@ -209,7 +213,7 @@ class Responder:
         histories = Histories.joined([question.history for question in questions])
         unknown = int((self.trained.users.numbers(histories.users) < 0).sum())
         self._count_unknown("unknown_users", unknown, len(questions))
-        numbers, scores, propensities = self._chooser.choose(
+        numbers, scores, propensities, began = self._chooser.choose(
             histories,
             np.asarray([question.request_id for question in questions], dtype=object),
             max(question.k for question in questions),
@@ -221,9 +225,19 @@ class Responder:
         columns = (
             values.tolist() for values in (self.trained.items.ids[numbers], scores, propensities)
         )
-        for question, count, *lists in zip(questions, counts, *columns, strict=True):
+        for question, count, start, *lists in zip(
+            questions, counts, began.tolist(), *columns, strict=True
+        ):
             items, logs, chances = (values[: min(count, question.k)] for values in lists)
-            yield Answer(items, logs, chances, question.request_id, *self._source)
+            yield Answer(
+                items,
+                logs,
+                chances,
+                question.request_id,
+                *self._source,
+                session_began=start,
+                excludes_seen=self._filter_seen,
+            )
 
 
 class _Arm(NamedTuple):

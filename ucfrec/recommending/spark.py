@@ -81,6 +81,14 @@ def _recommend_part(
     frames = recommended(trained, histories)
     with ExitStack() as stack:
         for path in exposures:
-            rule = recommended.keywords["rule"].hash
-            frames = stack.enter_context(exposures_written(path, trained, rule, frames))
+            how = recommended.keywords
+            written = exposures_written(
+                path,
+                trained,
+                how["rule"].hash,
+                frames,
+                excludes_seen=how["filter_seen"],
+                at=how["at"],
+            )
+            frames = stack.enter_context(written)
         return write_frames(out, frames)

@@ -56,7 +56,6 @@ class Ope(RuleOptions, LogOptions):
     discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
     pages: Annotated[bool, _ESTIMATED] = False
     reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
-    filter_seen: Annotated[bool, _ESTIMATED] = False
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return"""
@@ -80,10 +79,6 @@ class Ope(RuleOptions, LogOptions):
         options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
         if self.scored and not logs:
             raise InputError("--scored needs what ucfrec score wrote; name it after the run")
-        if self.scored and self.filter_seen:
-            raise InputError(
-                "--scored takes probabilities as they are; give --filter-seen to score"
-            )
         # On the test split, the weights that have not learned from it.
         policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
@@ -224,7 +219,6 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
 
     described_by = "ucfrec.python_api.recommender:Recommender.score"
 
-    filter_seen: bool = False
     out: Annotated[Path, OUTPUT]
     """Parquet or CSV file (with --engine spark: folder) to write; ope reads Parquet."""
     engine: Literal["torch", "spark"] = "torch"
@@ -253,14 +247,13 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
                 master,
                 checkpoint=self.checkpoint,
                 rule=rule,
-                filter_seen=self.filter_seen,
                 memory_limit=self.memory_limit,
             )
             print(f"{origin(self.out)}: {sessions:,} sessions")
             return
         with self.read_sessions([trained], self.logs, self.out) as logged:
             print(format_report(logged.report))
-            frames = score(trained, logged, rule, self.filter_seen)
+            frames = score(trained, logged, rule)
             unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}
             rows = write_frames(self.out, frames, about_scores(trained, rule) | unknown)
         print(f"\n{origin(self.out)}: {rows:,} rows")

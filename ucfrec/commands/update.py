@@ -57,7 +57,6 @@ class Update(LogOptions, RunArgument):
     no_refit: bool = False
     """Once the runs are compared, do not go on learning from the validation and test rows;
     (default: RUN2 acts by the weights that learned from all rows)"""
-    filter_seen: bool = False
     seed: int | None = None
     """Of everything random (default: that of RUN)"""
     threads: Annotated[int | None, POSITIVE] = None
@@ -89,9 +88,7 @@ class Update(LogOptions, RunArgument):
             split=SPLIT if self.split is None else parse_split(self.split),
             memory_limit=self.memory_limit,
         )
-        options = UpdateOptions(
-            append, seed=self.seed, refit=not self.no_refit, filter_seen=self.filter_seen
-        )
+        options = UpdateOptions(append, seed=self.seed, refit=not self.no_refit)
         record = update_run(
             run, files, self.out, store=self.store, mapping=mapping, options=options
         )

@@ -66,9 +66,6 @@ class EstimateOptions:
     """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
-    filter_seen: bool = False
-    """Exclude items that the user was shown before a step, as `recommend` and `serve` do by
-    default; then their logs have to be evaluated so."""
 
     def __post_init__(self) -> None:
         low, high = self.reward_range or (0.0, 0.0)
@@ -178,6 +175,8 @@ class Evidence:
     fingerprint: str | None = None
     models: ModelReport | None = None
     per_step: StepValue | None = None
+    excludes_seen: bool = False
+    """Whether logs say where items that users had seen were excluded."""
     forbidden: list[str] = field(default_factory=list)
     """What forbids a conclusion."""
     remarks: list[str] = field(default_factory=list)
@@ -211,6 +210,7 @@ def evaluate_off_policy(
     evidence = Evidence(
         steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
     )
+    evidence.excludes_seen = schema.EXCLUDES_SEEN in store.record.columns
     _doubt_logs(evidence, logged, options.pages)
     items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
@@ -266,7 +266,7 @@ def make_report(
         wanted_lift=options.wanted_lift,
         forbidden=evidence.forbidden,
         declared=evidence.declared,
-        filter_seen=options.filter_seen,
+        filter_seen=evidence.excludes_seen,
     )
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
     judged = evidence.columns | asdict(verdict) | diagnosis.list_columns()
@@ -286,7 +286,6 @@ def make_report(
             "discount": options.discount,
             "pages": options.pages,
             "anonymous": not options.users_known,
-            "filter_seen": options.filter_seen,
             "sessions": len(steps.first),
             "steps": evidence.rows,
             "choice": "softmax" if rule.draws else "greedy",
@@ -428,8 +427,7 @@ def collect_steps(
         array_on_disk((len(items), one_hot.shape[1])),
     )
     inputs = InputsFile(len(items))
-    shown_before = logged.rows if options.filter_seen else None
-    for batch in score_steps(trained, store, rule, shown_before):
+    for batch in score_steps(trained, store, logged.rows, rule):
         rows = slice(end, end + len(batch.steps))
         target[rows], probabilities, batch_inputs = make_inputs(trained, batch)
         groups.target[rows] = (probabilities @ one_hot).numpy()

@@ -187,12 +187,12 @@ def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> Episode
 def score_steps(
     trained: TrainedPolicy,
     store: EpisodeStore,
+    users: UserRows,
     rule: DecisionRule | None = None,
-    seen: UserRows | None = None,
 ) -> Iterator[ScoredSteps]:
     """Compute the policy's probabilities at every step of `store`, in order and in batches, under
-    its own rule or another; with `seen`, the rows of the users, without what a user was shown
-    before a step, as `recommend` and `serve` do by default.
+    its own rule or another; without what the `users` were shown before, where the logs say that it
+    was not on offer. Rows of one decision are drawn one after the other, given those before them.
     """
     n_items, total, scorer = len(trained.items), store.n_steps, trained.scorer(rule)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
@@ -210,9 +210,10 @@ def score_steps(
             windows = scorer.windows(sessions)
             query = scorer.query(sessions, windows)
             excluded = None
-            if seen is not None:
-                rows, seen_items = seen.seen(numbers[first])
-                pairs = np.unique((rows * n_items + seen_items)[seen_items < n_items])
+            if schema.EXCLUDES_SEEN in store.record.columns:
+                rows, seen_items = users.seen(numbers[first])
+                excludes = store.step_values(schema.EXCLUDES_SEEN, *at)[rows] > 0
+                pairs = np.unique((rows * n_items + seen_items)[excludes & (seen_items < n_items)])
                 rows, seen_items = np.divmod(pairs, n_items)
                 # A step that would have no item left excludes none.
                 left = np.bincount(rows, minlength=len(first))[rows] < n_items
@@ -257,10 +258,9 @@ def score(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     rule: DecisionRule | None = None,
-    filter_seen: bool = False,
 ) -> Iterator[pd.DataFrame]:
-    """Compute the policy's probability of every logged choice, under its own rule or another, in
-    logs without unknown items; with `filter_seen`, without what users were shown before a step.
+    """Compute the policy's probability of every logged choice, given those before it in its list,
+    under its own rule or another, in logs without unknown items.
 
     Yields:
         Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
@@ -268,7 +268,7 @@ def score(
         the logged item, its `rank` (from 1) among all, and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.items.ids
-    for batch in score_steps(trained, store, rule, logged.rows if filter_seen else None):
+    for batch in score_steps(trained, store, logged.rows, rule):
         column = batch.items.unsqueeze(1)
         take = partial(store.step_values, episodes=batch.episodes, steps=batch.steps)
         probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()

@@ -220,7 +220,6 @@ def score_with_spark(
     *,
     checkpoint: str = "best",
     rule: DecisionRule | None = None,
-    filter_seen: bool = False,
     memory_limit: str = "2GB",
 ) -> int:
     """Write the probability of every choice of logs, as `score` finds it, to Parquet parts in the
@@ -245,7 +244,7 @@ def score_with_spark(
     with atomic_folder(out) as folder:
         run = RunOnWorkers(trained.folder.absolute(), checkpoint, trained.fingerprint)
         rule = rule or trained.rule
-        score_part = partial(_score_part, run, folder.absolute(), memory_limit, rule, filter_seen)
+        score_part = partial(_score_part, run, folder.absolute(), memory_limit, rule)
         sessions = map_users(log, folder.parent, master, score_part)
         number_sessions(folder, sessions)
     return sum(sessions)
@@ -256,7 +255,6 @@ def _score_part(
     folder: Path,
     memory_limit: str,
     rule: DecisionRule,
-    filter_seen: bool,
     part: int,
     rows: Path,
     mapping: LogMapping,
@@ -267,7 +265,7 @@ def _score_part(
     _, options = training_options(trained, mapping, memory_limit)
     options = replace(options, reward=schema.REWARD)
     with prepare_sessions(trained, [rows], mapping, options) as logged:
-        frames = score(trained, logged, rule, filter_seen)
+        frames = score(trained, logged, rule)
         write_frames(folder / part_name(part), frames, about_scores(trained, rule))
         return logged.store.n_episodes
 

@@ -420,22 +420,19 @@ class Recommender:
         logs: Logs,
         *,
         rule: DecisionRule | None = None,
-        filter_seen: bool = False,
         mapping: Columns | None = None,
     ) -> pd.DataFrame:
         """The policy's probability of every logged choice: `ucfrec score`.
 
         Args:
             logs: as for `fit`.
-            filter_seen: exclude items that the user was shown before, as `recommend` does by
-                default: for logs of what it showed.
 
         Returns:
             One row per logged step; see `ucfrec.off_policy.score.score`.
         """
         trained = self._load_for(logs)
         with read_logs(trained, logs, mapping, keep_unknown=False) as logged:
-            return pd.concat(score(trained, logged, rule, filter_seen), ignore_index=True)
+            return pd.concat(score(trained, logged, rule), ignore_index=True)
 
     @_checked
     def update(
@@ -445,7 +442,6 @@ class Recommender:
         *,
         window_days: float | None = None,
         refit: bool = True,
-        filter_seen: bool = False,
         mapping: Columns | None = None,
     ) -> Self:
         """Bring the policy up to date with new logs: `ucfrec update`.
@@ -457,14 +453,13 @@ class Recommender:
             window_days: leave out sessions that ended longer ago, before the end of the new logs;
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
-            filter_seen: compare them where items that the user was shown before are excluded.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and
             the verdict on both.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
-        options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
+        options = UpdateOptions(AppendOptions(window), refit=refit)
         opened = open_files(self.trained, logs, mapping)
         with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)

@@ -35,9 +35,6 @@ class UpdateOptions:
     refit: bool = True
     """Go on learning from the newest rows, too, once the runs are compared; see
     `ucfrec.runs.refit`."""
-    filter_seen: bool = False
-    """Compare the runs as they act where items that the user was shown before are excluded, as
-    `recommend` and `serve` do by default."""
 
 
 @random_state_kept()
@@ -115,9 +112,9 @@ def update_run(
         newest = opened.split("test")
         earlier = opened.select(np.flatnonzero(split != schema.SPLITS.index("test")))
         users = newest.episode_values(schema.USER)
-        seen = UserRows.of(newest, users, earlier) if options.filter_seen else None
+        rows = UserRows.of(newest, users, earlier)
         new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
-        verdict = compare_runs(new, acting, newest, seed, seen)
+        verdict = compare_runs(new, acting, rows, seed)
         update = record.update.model_copy(update={"drift": changes, "verdict": verdict})
         record = record.copy_with(update=update).write(out)
     if options.refit:

@@ -35,9 +35,8 @@ _SEEN_REMOVED = "as where it was served without seen items: update with --filter
 def compare_runs(
     new: TrainedPolicy,
     old: TrainedPolicy,
-    rows: EpisodeStore,
+    newest: UserRows,
     seed: int,
-    seen: UserRows | None = None,
 ) -> UpdateVerdict:
     """Compare two runs, each under its own rule.
 
@@ -47,15 +46,15 @@ def compare_runs(
 
     Args:
         new: trained on a store that was grown from that of `old`.
-        rows: newest episodes of the grown store, which neither was trained on.
-        seen: rows of the users of the grown store, if items that a user was shown before are
-            excluded.
+        newest: episodes of the grown store that neither was trained on, and the earlier rows of
+            their users.
     """
+    rows = newest.later
     user = rows.episode_values(schema.USER).astype(np.int64)[rows.all_steps()[0]]
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)
-    new_probability, new_gain = _judge_items(new, rows, seen)
-    old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
+    new_probability, new_gain = _judge_items(new, rows, newest)
+    old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), newest)
     gained = (new_gain - old_gain) * liked
     differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
     if schema.PROPENSITY in rows.record.columns:
@@ -66,7 +65,7 @@ def compare_runs(
             earned, owner = reward[weighed].astype(np.float64), user[weighed]
             # The mean reward is a control variate: weights of both policies have mean 1.
             lift = (weights[:, 0] - weights[:, 1]) * (earned - earned.mean())
-            doubt = _doubt(weights, owner, seen is not None)
+            doubt = _doubt(weights, owner, schema.EXCLUDES_SEEN in rows.record.columns)
             differences.append(_compare(VALUE, lift, np.ones(len(lift)), owner, seed, doubt))
     decisive = differences[-1]
     return UpdateVerdict(
@@ -93,12 +92,12 @@ def describe(verdict: UpdateVerdict) -> str:
 
 
 def _judge_items(
-    trained: TrainedPolicy, view: EpisodeStore, seen: UserRows | None
+    trained: TrainedPolicy, view: EpisodeStore, rows: UserRows
 ) -> tuple[Float64Array, Float64Array]:
     """Of N logged items, (N,) probability under a run's rule, and (N,) 1 / log2(1 + rank) among the
     first ten; 0 of others, and of items that it does not know, which are −1."""
     probabilities, gains = [], []
-    for batch in score_steps(trained, view, None, seen):
+    for batch in score_steps(trained, view, rows):
         column, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
         probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
         # From 1; items of equal scores share the mean rank.

@@ -366,7 +366,7 @@ class UserRows:
     def continue_sessions(self, gap_ms: float | None) -> EpisodeStore:
         """The later log, with the rows before it in the sessions that go on in it; a pause of more
         than `gap_ms` ends one, None none. Earlier rows are known but `all_steps` excludes them."""
-        if self.earlier is None:
+        if self.earlier is None and schema.SESSION_BEGAN not in self.later.record.columns:
             return self.later
         begin = self.place[np.cumsum(self.later.lengths) - self.later.lengths]
         counts = np.minimum(begin - self._begins(begin, gap_ms), LONGEST_HISTORY)
@@ -401,13 +401,20 @@ class UserRows:
         an earlier row, or the same."""
         times = self.values(schema.TIMESTAMP, self.source).astype(np.int64)
         pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
-        if gap_ms is not None and schema.SESSION_BEGAN in self.later.record.columns:
-            began = self.values(schema.SESSION_BEGAN, self.source)[1:]
-            pause = np.where(began < 0, pause, began > times[:-1])
         breaks = np.append(True, pause | (self.source[:-1] >= 0))
         breaks[self.first] = True
         starts = np.flatnonzero(breaks)
-        return np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
+        begins = np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
+        if gap_ms is None or schema.SESSION_BEGAN not in self.later.record.columns:
+            return begins
+        # Rows from the time on that the log names, of users by their first rows.
+        began = self.later.step_values(schema.SESSION_BEGAN, *self.later.locate(self.source[begin]))
+        users, low = np.unique(self.first), times.min()
+        owner = np.searchsorted(users, np.arange(len(times)), side="right")
+        span = times.max() - low + 1
+        keys, wanted = owner * span + times - low, (began - low).clip(0, span - 1)
+        named = np.searchsorted(keys, owner[begin] * span + wanted)
+        return np.where(began < 0, begins, np.minimum(named, begin))
 
 
 def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray:

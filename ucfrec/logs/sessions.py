@@ -43,6 +43,7 @@ EPISODE_USERS: Final = "episode_users.parquet"
 ID_TABLES: Final = ((schema.USER_ID, "users", USERS_FILE), (schema.ITEM_ID, "items", ITEMS_FILE))
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
 _BINS = 2**16
+_NEIGHBOURS = slice(None, -1), slice(1, None)
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,9 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         if cut.session_by == "gap":
             pause = times[1:] - times[:-1] > cut.gap_ms
             if schema.SESSION_BEGAN in batch:
-                began = batch[schema.SESSION_BEGAN][1:]
-                pause = np.where(began < 0, pause, began > times[:-1])
+                before, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
+                other = np.where(before < 0, began > times[:-1], began != before)
+                pause = np.where(began < 0, pause, other)
             ends = user_ends | np.append(pause, True)
             last_ends = rows.last_ms - times > cut.gap_ms
         elif cut.session_by == schema.SESSION_ID:

@@ -23,7 +23,7 @@ LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 """ρ_low and ρ_high of the acceptance heatmap."""
 
-_COPIES = "a run with augmented episodes among --runs (`ucfrec-control train --policy ucf`)"
+_COPIES = "a run with augmented episodes among --runs (`ucfrec-control train --policy ucf-paper`)"
 NEEDS = {
     "moves": _COPIES,
     "states": _COPIES,

@@ -44,7 +44,7 @@ PAPER: Final[Mapping[str, Method]] = {
         ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0"),
     ),
 }
-"""UCF with the paper's losses and generator, with Appendix H's copies and with Algorithm 5's."""
+"""UCF as read in the paper, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Final[Mapping[str, Method]] = {
     "popular": _simple("popular"),
     "item-rate": _simple("item-rate", vectors=False),

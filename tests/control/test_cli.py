@@ -36,7 +36,7 @@ def test_seeds_that_are_none_are_refused() -> None:
         ("evaluate run --target abc", "abc is no target; give a number or max"),
         ("evaluate {run} --env Nope-v1", "Nope-v1 cannot be made"),
         ("evaluate {run} --env Walker2d-v5", "sizes (17, 6)"),
-        ("evaluate {run} --episodes 0", "at least one"),
+        ("evaluate {run} --episodes 0", "--episodes: 0 is not"),
         ("evaluate {run} --episodes 1 --target max", "policy.max_return=true"),
         ("collect --env Hopper-v5 --out out --agent a.zip --noise nan", "give at least 0"),
         ("collect --env Nowhere-v0 --out out --agent a.zip", "Nowhere-v0 cannot be made"),

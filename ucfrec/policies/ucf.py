@@ -182,7 +182,7 @@ class UCFPaperPolicy(UCFPolicy):
         "crm.max_transitions": 10**9,
         "csg.kind": "faithful",
         "csg.max_transitions": 10**9,
-        "augment.max_steps": 10**12,
+        "augment.max_steps": 10**9,
         "rule.choose": False,
         "train.average": 0.0,
     }

@@ -28,7 +28,7 @@ PAPER_ABLATIONS: Methods = {
         (
             *("augment.copies=1", "csg.kind=faithful", "csg.max_transitions=1000000000"),
             *("crm.mean_first=false", "crm.learning_rate=3e-4", "crm.epochs=40"),
-            *("crm.max_transitions=1000000000", "augment.max_steps=1000000000000"),
+            *("crm.max_transitions=1000000000", "augment.max_steps=1000000000"),
             "train.average=0.0",
         ),
     ),

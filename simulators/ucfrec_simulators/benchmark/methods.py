@@ -102,7 +102,8 @@ that is NX_10: all its sessions have the same length, so early exits do not hide
 effect."""
 BUDGETS: Final[Mapping[str, Budget]] = {
     # Sized for two cores: smaller width, fewer steps, smaller logs, fewer tasks beside those of the
-    # main table, and cheaper settings of two baselines; methods and seeds are not reduced.
+    # main table, cheaper settings of two baselines, of the paper's settings only the steps; methods
+    # and seeds are not reduced.
     "small": Budget(
         name="small",
         seeds=3,

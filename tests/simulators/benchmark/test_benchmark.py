@@ -12,13 +12,7 @@ import pytest
 
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
-from ucfrec.benchmark.cells import (
-    Budget,
-    Evaluation,
-    describe_updates,
-    make_key,
-    training_config,
-)
+from ucfrec.benchmark.cells import Budget, Evaluation, describe_updates, make_key, training_config
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main

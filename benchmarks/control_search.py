@@ -20,7 +20,6 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Cell, Measurement, Method, Plan, Task, open_store
 from ucfrec.benchmark.grid import run_grid
-from ucfrec.benchmark.tables import average_seeds
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
@@ -31,6 +30,7 @@ from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import RATE, SCORE_MEASUREMENT, config, train
 from ucfrec_control.benchmark.methods import MAIN
 from ucfrec_control.benchmark.plan import SEARCHED, presets_of, score_cells, set_contexts
+from ucfrec_control.benchmark.seeds import average_seeds
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.training.rl_baselines import ALGORITHMS, RLPolicy

@@ -8,12 +8,10 @@ import pytest
 
 from tests.support.result_rows import distractor_rows, result_row
 from ucfrec.benchmark.tables import (
-    average_seeds,
     difference_table,
     distractor_table,
     method_table,
     score_table,
-    select_best_target,
 )
 from ucfrec.results.rows import ResultRow
 
@@ -43,24 +41,6 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
     assert best_iql == iql
     more = scored("a", "dt", 2, 18.0, metrics=kept)
     assert score_table([*rows, more], "last")[0]["seeds"] == "2–3"
-
-
-def test_of_several_targets_the_best_in_the_mean_counts() -> None:
-    scores = {1.0: (50.0, 10.0), 2.0: (20.0, 45.0), 3.0: (0.0, 49.0)}
-    rows = [scored("t", "iql", 0, 5.0)]
-    for target, seeds in scores.items():
-        rows += [scored("t", "dt", n, score, target_return=target) for n, score in enumerate(seeds)]
-    kept = select_best_target(rows)
-    assert [(row.target_return, row.value) for row in kept] == [(None, 5), (2, 20), (2, 45)]
-
-
-def test_what_was_not_measured_is_a_dash() -> None:
-    rows: list[dict[str, Any]] = [{"method": "dt", "score": 1.0, "other": None}]
-    rows += [{"method": "dc", "score": 5.0}, {"method": "dt", "score": 3.0, "other": 4.0}]
-    assert average_seeds(rows, ("method",), ("score", "other")) == [
-        {"method": "dt", "score": "2 ± 1.4", "other": "4"},
-        {"method": "dc", "score": "5", "other": "–"},
-    ]
 
 
 @pytest.mark.parametrize("scores", [(100.0, 95.1, 94.9), (-10.0, -10.4, -10.6)])

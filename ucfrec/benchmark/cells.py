@@ -5,10 +5,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.provenance import config_hash
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
@@ -17,6 +16,11 @@ from ucfrec.runs.screened import SCREENING
 
 Presets = Mapping[str, Mapping[str, Any]]
 """Defaults of settings, by table."""
+PAPER_UCF: Final = "ucf-paper"
+"""What the names of methods with the paper's settings begin with; a budget shortens their training,
+and changes nothing else (`Budget.shorten`)."""
+UPDATES: Final = "updates"
+"""Detail of their rows: in words, how much of its training they had."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,17 @@ class Budget:
         fewer = self.fewer_seeds
         return min(self.seeds, fewer.get(task, self.seeds), fewer.get(method, self.seeds))
 
+    def shorten(self, method: Method, presets: Presets | None = None) -> tuple[str, ...]:
+        """Settings of a training that keeps those of a method and its presets but for the number of
+        updates, if the budget's is smaller, in proportion that of the warm-up, and how often it is
+        validated."""
+        preset = resolve_config(method.policy, presets=presets).train
+        values = dict(setting.split("=", 1) for setting in self.settings)
+        steps = min(int(values.get("train.steps", preset.steps)), preset.steps)
+        warmup = preset.warmup_steps * steps // preset.steps
+        rarely = tuple(s for s in self.settings if s.startswith("train.validate_every="))
+        return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *rarely, *method.settings)
+
     def narrow(
         self,
         tasks: Sequence[str] = (),
@@ -126,14 +141,7 @@ class Budget:
         logs: int | None = None,
         evaluation_seed: int | None = None,
     ) -> "Budget":
-        """The budget with other tasks, seeds and logs, where they are given.
-
-        Raises:
-            InputError: `seeds` or `logs` is below 1.
-        """
-        for name, number in (("training seeds", seeds), ("logs", logs)):
-            if number is not None and number < 1:
-                raise InputError(f"{number} {name} are requested; at least one is needed")
+        """The budget with other tasks, seeds and logs, where they are given."""
         changes: dict[str, Any] = {"logs": logs or self.logs}
         if tasks:
             changes |= {"tasks": tuple(tasks), "tasks_of": {}, "optional": ()}
@@ -191,6 +199,15 @@ def make_key(cell: Cell) -> RowKey:
         conditions={**cell.conditions, **evaluation},
         data_fingerprint=None if cell.store is None else open_store(cell).record.fingerprint,
     )
+
+
+def describe_updates(cell: Cell) -> dict[str, str]:
+    """What a row of a method with the paper's settings says of the length of its training."""
+    if not cell.method.startswith(PAPER_UCF):
+        return {}
+    preset = resolve_config(cell.policy, presets=cell.presets).train
+    share = 100 * cell.config.train.steps / preset.steps
+    return {UPDATES: f"the paper's settings, {share:.2g}% of its updates"}
 
 
 def training_config(cell: Cell) -> dict[str, Any] | None:

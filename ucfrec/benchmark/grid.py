@@ -37,11 +37,8 @@ def run_grid(
         again: remove the rows, runs and shared stages of `cells` first.
 
     Raises:
-        InputError: `workers` is below 1, a line of `results` is not a result row, or at least one
-            cell failed.
+        InputError: a line of `results` is not a result row, or at least one cell failed.
     """
-    if workers < 1:
-        raise InputError(f"--workers is {workers}; at least one is needed")
     tasks: dict[str, tuple[RowKey, Cell]] = {}
     for cell in cells:
         config = how.config(cell)

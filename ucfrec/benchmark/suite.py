@@ -7,6 +7,7 @@ from typing import Protocol
 
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.benchmark.grid import run_grid, select_names
+from ucfrec.benchmark.tables import note_updates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.results.rows import ResultRow
@@ -22,8 +23,8 @@ class Shown:
     markdown: Callable[[Rows], str]
 
     def show(self, rows: Rows) -> str:
-        """The table below its title, as Markdown."""
-        return f"## {self.title}\n\n{self.markdown(rows)}"
+        """The table between its title and notes, as Markdown."""
+        return "\n\n".join([f"## {self.title}", self.markdown(rows), *note_updates(rows)])
 
 
 class Cells(Protocol):

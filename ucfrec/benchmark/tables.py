@@ -2,8 +2,9 @@
 method."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
+from ucfrec.benchmark.cells import PAPER_UCF, UPDATES
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
@@ -50,6 +51,12 @@ def _group_methods(
     rows: Sequence[ResultRow],
 ) -> Mapping[tuple[str | None, str], Sequence[ResultRow]]:
     return grouped(_select_checkpoint(rows), lambda row: (row.environment, row.method))
+
+
+def note_updates(rows: Iterable[ResultRow]) -> list[str]:
+    """What rows with the paper's settings say of the length of their trainings."""
+    notes = dict.fromkeys(row.details.get(UPDATES) for row in rows)
+    return [f"{PAPER_UCF}…: {note}" for note in notes if note is not None]
 
 
 def _average(rows: Sequence[ResultRow], metrics: Sequence[str]) -> list[str]:
@@ -116,28 +123,6 @@ def _format_score(scores: Summary, best: float) -> str:
 def _name_columns(rows: Sequence[ResultRow], texts: Iterable[str]) -> dict[str, str]:
     """Texts of all datasets of the rows, and of the mean over them, by name."""
     return dict(zip((*dict.fromkeys(row.task for row in rows), "mean"), texts, strict=True))
-
-
-def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """Rows of the target return with the highest mean over seeds, for each dataset, method and
-    checkpoint."""
-    best: list[ResultRow] = []
-    for group in grouped(rows, lambda row: (row.task, row.method, row.checkpoint)).values():
-        targets = grouped(group, lambda row: row.target_return).values()
-        best += max(targets, key=lambda same: summary(row.value for row in same).mean)
-    return best
-
-
-def average_seeds(
-    lines: Sequence[Mapping[str, Any]], by: Sequence[str], values: Sequence[str]
-) -> list[dict[str, Any]]:
-    """One line per combination of `by`: `values`, where a line of `ResultRow.as_line` has them, as
-    mean ± standard deviation over seeds."""
-    return [
-        dict(zip(by, key, strict=True))
-        | {n: mean_and_sd(ln[n] for ln in group if ln.get(n) is not None) for n in values}
-        for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items()
-    ]
 
 
 def difference_table(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, SEED, Group, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Group, Table, settings_given
 from ucfrec.commands.shared_options import EnvironmentOptions
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
@@ -28,7 +28,7 @@ class GridOptions(Table):
     results: Annotated[Path | None, "JSONL"] = None
     """File of result rows; measured cells are read from it, new ones appended to it (default:
     results.jsonl in --out)"""
-    workers: int = os.cpu_count() or 1
+    workers: Annotated[int, POSITIVE] = os.cpu_count() or 1
     again: bool = False
     show_only: bool = False
     """Print the tables from the rows in --results without measuring anything."""
@@ -71,9 +71,9 @@ class Benchmark(EnvironmentOptions, GridOptions):
     env: str | None = None
     """Simulator or gymnasium:ID; its main table is measured instead of the suite's tasks, on logs
     of its mixture or, where it has none, of random actions (default: the suite's tasks)"""
-    logs: Annotated[int | None, _LOGS, "N"] = None
+    logs: Annotated[int | None, _LOGS, POSITIVE, "N"] = None
     log_seed: Annotated[int, _LOGS] = 0
-    training_seeds: Annotated[int | None, _LOGS, "N"] = None
+    training_seeds: Annotated[int | None, _LOGS, POSITIVE, "N"] = None
     evaluation_seed: Annotated[int | None, _LOGS, SEED, "SEED"] = None
 
     def execute(self) -> None:

@@ -38,8 +38,8 @@ _LEVELS = 2**16
 class UCFConfig(PolicyConfig):
     """Settings of UCF's hybrid policy.
 
-    Defaults are those of the paper's Tables 6 to 8, except λ and the weight of a_{t−1}, which were
-    chosen on validation episodes (`benchmarks/LOG.md`).
+    Defaults are those of the paper's Tables 6 to 8, as far as they name a setting, except λ, which
+    was chosen on validation episodes, as was the weight of a_{t−1} (`benchmarks/LOG.md`).
     """
 
     conv_blocks: Layers = 2
@@ -169,10 +169,9 @@ class UCFPolicy(SequencePolicy):
 
 
 class UCFPaperPolicy(UCFPolicy):
-    """UCF as read in the paper, without what later measurements added: augmented states, λ 0.1
-    (our choice), a plain CVAE as reward model at Table 4's rate and passes, the paper's generator,
-    all transitions, the return of the whole rest, and the most probable action at the largest
-    training return."""
+    """UCF as read in the paper, without what later measurements added: supervised attention, a
+    plain CVAE and the paper's generator on all transitions, returns of the whole rest, and the most
+    probable action at the largest training return."""
 
     Config = UCFPaperConfig
     augmented = True
@@ -183,6 +182,7 @@ class UCFPaperPolicy(UCFPolicy):
         "crm.max_transitions": 10**9,
         "csg.kind": "faithful",
         "csg.max_transitions": 10**9,
+        "augment.max_steps": 10**9,
         "rule.choose": False,
         "train.average": 0.0,
     }

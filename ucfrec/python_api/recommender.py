@@ -537,7 +537,7 @@ class Recommender:
 
 
 UCF = Recommender
-"""A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
+"""A `Recommender`, whose default policy is the Unified Causal Transformer."""
 
 
 def _name_logs(logs: Logs | None) -> str:

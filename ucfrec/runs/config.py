@@ -65,8 +65,8 @@ def resolve_config(
 
     Args:
         policy_name: one of `ucfrec.policies.registry.policy_names`. The default of `augment.copies`
-            is 0 for policies other than UCF: `--policy dt` is the plain baseline and `--policy dt
-            --set augment.copies=1` is the ablation `w/o Arch`.
+            is 0 for policies other than `ucf-paper`; `--policy dt --set augment.copies=1` is DT on
+            copies of UCF's own generator.
         file: TOML with tables `policy`, `train`, `crm`, `csg`, `augment` and `rule`.
         overrides: texts `table.field=value`, the value in TOML syntax; or a mapping, either nested
             (`{"train": {"steps": 200}}`) or flat (`{"train.steps": 200}`).

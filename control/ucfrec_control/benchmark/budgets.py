@@ -3,14 +3,13 @@
 from dataclasses import replace
 from typing import Final
 
-from ucfrec.benchmark.cells import Budget, Evaluation
+from ucfrec.benchmark.cells import PAPER_UCF, Budget, Evaluation
 from ucfrec_control.benchmark.methods import (
     EQUAL_TIME,
     LAMBDA,
     LONGER,
     MAIN,
     METHODS,
-    PAPER_UCF,
     PURSUING,
     ROBUSTNESS,
     TABLES,

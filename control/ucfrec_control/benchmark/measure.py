@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from ucfrec.benchmark.cells import Cell, Measurement, open_store, training_config
+from ucfrec.benchmark.cells import Cell, Measurement, describe_updates, open_store, training_config
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
-from ucfrec_control.benchmark.methods import PAPER_UCF
 from ucfrec_control.benchmark.robustness import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.training.evaluate import evaluate_run
@@ -23,10 +22,6 @@ from ucfrec_control.training.rl_baselines import (
 )
 from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
-PRESET_STEPS: Final = 100_000
-"""Updates of the presets, which a budget may shorten."""
-UPDATES: Final = "updates"
-"""Detail of rows with the paper's settings: in words, how much of its training they had."""
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
 DISTRACTOR: Final = "distractor"
@@ -81,14 +76,6 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         return rows
     # Rows of one seed that differ in their target are measurements of their own.
     return [replace(r, conditions={**r.conditions, TARGET: r.target_return}) for r in rows]
-
-
-def describe_updates(cell: Cell) -> dict[str, str]:
-    """What a row with the paper's settings says of the length of its training."""
-    if not cell.method.startswith(PAPER_UCF):
-        return {}
-    share = 100 * cell.config.train.steps / PRESET_STEPS
-    return {UPDATES: f"the paper's settings, {share:.2g}% of its updates"}
 
 
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:

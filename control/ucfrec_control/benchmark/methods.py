@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from ucfrec.benchmark.cells import Method, make_augmented_ucf
+from ucfrec.benchmark.cells import PAPER_UCF, Method, make_augmented_ucf
 
 SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
@@ -13,9 +13,6 @@ _ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_
 _NO_GATE = "augment.epsilon_r=1e9"
 """Disables the gate on the change of the reward; the limit on a move's length stays."""
 LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
-PAPER_UCF = "ucf-paper"
-"""What the names of methods with the paper's settings begin with; a budget shortens their
-training, and changes nothing else (`settings_of`)."""
 
 
 def _paper_rows(rows: Mapping[str, tuple[str, ...]]) -> Methods:
@@ -31,7 +28,8 @@ PAPER_ABLATIONS: Methods = {
         (
             *("augment.copies=1", "csg.kind=faithful", "csg.max_transitions=1000000000"),
             *("crm.mean_first=false", "crm.learning_rate=3e-4", "crm.epochs=40"),
-            *("crm.max_transitions=1000000000", "train.average=0.0"),
+            *("crm.max_transitions=1000000000", "augment.max_steps=1000000000"),
+            "train.average=0.0",
         ),
     ),
 }

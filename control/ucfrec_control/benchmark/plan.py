@@ -8,14 +8,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from ucfrec.benchmark.cells import Budget, Cell, Method, Plan, Presets, Task
+from ucfrec.benchmark.cells import PAPER_UCF, Budget, Cell, Method, Plan, Presets, Task
 from ucfrec.benchmark.grid import select_names
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec_control.benchmark.measure import DISTRACTOR, PRESET_STEPS, RATE
+from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import (
     METHODS,
     METHODS_WO_TIME,
-    PAPER_UCF,
     ROBUST,
     ROBUSTNESS,
     SCORES,
@@ -24,9 +23,7 @@ from ucfrec_control.benchmark.methods import (
 )
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.training.rl_baselines import ALGORITHMS
-from ucfrec_control.training.train import dataset_of, preset_of
-
-PRESET_WARMUP: Final = 10_000
+from ucfrec_control.training.train import dataset_of, find_preset, preset_of
 
 
 def score_cells(
@@ -124,24 +121,16 @@ def chosen_rates(budget: str) -> Mapping[str, float]:
 
 
 def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
-    """Settings of a training over its presets: the budget's, the chosen rate, the method's own.
-
-    Of the paper's settings a budget changes the number of updates alone, and in proportion that of
-    the warm-up; what it does not learn from, such as how often it is validated, is the budget's.
-    """
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own; of
+    methods with the paper's settings only the number of updates is the budget's."""
+    longer = budget.of_methods.get(name, ())
     if name.startswith(PAPER_UCF):
-        values = dict(setting.split("=", 1) for setting in budget.settings)
-        steps = int(values.get("train.steps", PRESET_STEPS))
-        warmup, every = PRESET_WARMUP * steps // PRESET_STEPS, "train.validate_every"
-        shorter = (f"train.steps={steps}", f"train.warmup_steps={warmup}")
-        rarely = (f"{every}={values[every]}",) if every in values else ()
-        return (*shorter, *rarely, *method.settings, *budget.of_methods.get(name, ()))
+        return (*budget.shorten(method, find_preset("", "", method.policy).tables), *longer)
     policy_settings = budget.of_policies.get(method.policy, ())
     rate = _rate_of(budget, method)
     if method.policy in ALGORITHMS:
         return (*policy_settings, *(() if rate is None else (f"{RATE}={rate:g}",)))
     searched = () if rate is None else (f"train.{RATE}={rate:g}",)
-    longer = budget.of_methods.get(name, ())
     return (*budget.settings, *policy_settings, *searched, *method.settings, *longer)
 
 

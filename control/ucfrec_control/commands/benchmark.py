@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from ucfrec.benchmark.tables import average_seeds, difference_table, score_table, select_best_target
+from ucfrec.benchmark.tables import difference_table, note_updates, score_table
 from ucfrec.commands.options import Names
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow
-from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT, UPDATES
-from ucfrec_control.benchmark.methods import MAIN, PAPER_UCF, SCORES, TABLES
+from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
 from ucfrec_control.benchmark.plan import chosen_rates, score_cells
+from ucfrec_control.benchmark.seeds import average_seeds, select_best_target
 from ucfrec_control.commands.options import SuiteOptions
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
@@ -46,9 +47,8 @@ class Benchmark(SuiteOptions):
 def print_scores(rows: Sequence[ResultRow], table: str) -> None:
     """Print the tables of rows of a benchmark, and how learning rates were chosen."""
     _print_tables(rows, table)
-    for updates in dict.fromkeys(row.details.get(UPDATES) for row in rows):
-        if updates is not None:
-            print(f"\n{PAPER_UCF}…: {updates}")
+    for note in note_updates(rows):
+        print(f"\n{note}")
     for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
         rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
         default = "not searched: the budget's, over the presets"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ucfrec.commands.options import ARGUMENT, SEED, Table
+from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow, write_results
@@ -28,7 +28,7 @@ class Evaluate(Table):
     """Run folders."""
     env: str | None = None
     """Environment to evaluate in (default: that of the data)"""
-    episodes: int = 20
+    episodes: Annotated[int, POSITIVE] = 20
     """Episodes of each policy and target."""
     seed: Annotated[int, SEED] = 0
     """Of the episodes."""

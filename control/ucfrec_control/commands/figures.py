@@ -20,9 +20,8 @@ class Figures(Table):
 
     def execute(self) -> None:
         """Run `ucfrec-control figures`."""
-        from ucfrec_control.figures.figures import (
-            make_figures,  # matplotlib takes half a second to import
-        )
+        # matplotlib takes half a second to import
+        from ucfrec_control.figures.figures import make_figures
 
         files, missing = make_figures(self.runs, self.results, self.out)
         print("\n".join(map(str, files)))

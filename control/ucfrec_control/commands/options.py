@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.commands.benchmark import ROWS_REMEDY, GridOptions
-from ucfrec.commands.options import ARGUMENT, SEED, Table
+from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Table
 from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.results.rows import ResultRow, benchmarking
 from ucfrec_control.benchmark.budgets import budget_of
@@ -87,10 +87,10 @@ class ControlGridOptions(GridOptions):
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
     times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
     of the papers)"""
-    seeds: Annotated[int | None, "N"] = None
+    seeds: Annotated[int | None, POSITIVE, "N"] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""
     out: Path = Path("runs/control")
-    workers: int = 1
+    workers: Annotated[int, POSITIVE] = 1
 
     def require_data(self) -> Path:
         """The folder of the HDF5 files.
@@ -118,11 +118,7 @@ class ControlGridOptions(GridOptions):
     def narrow_budget(
         self, budget: Budget, files: Sequence[str] = (), evaluation_seed: int | None = None
     ) -> Budget:
-        """`budget` with the seeds and contexts of the options.
-
-        Raises:
-            InputError: `--seeds` is below 1.
-        """
+        """`budget` with the seeds and contexts of the options."""
         budget = budget.narrow(files, self.seeds, evaluation_seed=evaluation_seed)
         return set_contexts(budget, dict(self.context))
 

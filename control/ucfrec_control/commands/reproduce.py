@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final
 
-from ucfrec.benchmark.cells import Budget, Cell
+from ucfrec.benchmark.cells import PAPER_UCF, Budget, Cell
 from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
 from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
-from ucfrec_control.benchmark.methods import MAIN, PAPER_ABLATIONS, PAPER_UCF, ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.methods import MAIN, PAPER_ABLATIONS, ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.plan import robustness_cells, score_cells
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import ControlGridOptions

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from ucfrec.benchmark.tables import average_seeds
+from ucfrec.benchmark.tables import note_updates
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
@@ -16,6 +16,7 @@ from ucfrec_control.benchmark.robustness import (
     largest_drops,
     screening_rows,
 )
+from ucfrec_control.benchmark.seeds import average_seeds
 from ucfrec_control.commands.options import SuiteOptions
 
 
@@ -39,3 +40,5 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
     # A store is screened once, whatever method and seed it is for.
     screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
     print(format_rows(list(screened.values()), SHOWN_SCREENING))
+    for note in note_updates(rows):
+        print(f"\n{note}")

@@ -121,9 +121,9 @@ def write_d4rl(
 def _require_aligned(steps: Mapping[str, Array], path: Path) -> None:
     n = len(steps["rewards"]) if steps["rewards"].ndim else 0
     for name, values in steps.items():
-        two = name not in ("rewards", "terminals", "timeouts")
-        if values.ndim != 1 + two:
-            raise InputError(f"{path}: {name} have shape {values.shape}, not {1 + two} dimensions")
+        form = "(N,)" if name in ("rewards", "terminals", "timeouts") else "(N, size)"
+        if values.ndim != len(form.split()):
+            raise InputError(f"{path}: {name} have shape {values.shape}; write them as {form}")
         if name != _FINAL and len(values) != n:
             raise InputError(f"{path}: {name} have {len(values)} rows, rewards have {n}")
         if name.endswith("observations") and values.shape[1:] != steps["observations"].shape[1:]:

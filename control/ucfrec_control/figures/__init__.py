@@ -1,1 +1,1 @@
-"""Pictures of the paper, from stored results."""
+"""The paper's kinds of figures, from stored results."""

@@ -61,12 +61,14 @@ def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     training mean; at most 3,000 drawn from a run's counterfactual copies.
 
     Raises:
-        InputError: the run made no copies, or its store is gone.
+        InputError: the run made no copies, or no edit of them was accepted, or its store is gone.
     """
     _augmentation(run)
     store = store_of(run)
     copies = AugmentedEpisodes.load(run / AUGMENTED, store)
     rng, edits = np.random.default_rng(seed), len(copies.edit_step)
+    if not edits:
+        raise InputError(f"{run}: no edit of a state was accepted")
     rows = rng.choice(edits, min(edits, _POINTS), replace=False)
     episodes = copies.copy_source[copies.edit_copy[rows]]
     factual = store.windows(episodes, copies.edit_step[rows], 1).states[:, 0]

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ucfrec.benchmark.tables import select_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.reporting.charts import save
 from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN
 from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.seeds import select_best_target
 from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.training.evaluate import EVALUATE, method_of
@@ -23,7 +23,7 @@ LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 """ρ_low and ρ_high of the acceptance heatmap."""
 
-_COPIES = "a run with augmented episodes among --runs (`ucfrec-control train --policy ucf`)"
+_COPIES = "a run with augmented episodes among --runs (`ucfrec-control train --policy ucf-paper`)"
 NEEDS = {
     "moves": _COPIES,
     "states": _COPIES,

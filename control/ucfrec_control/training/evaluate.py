@@ -70,8 +70,6 @@ def evaluate_run(
         InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
             environment is unknown or cannot be made, or `reference` does not rise.
     """
-    if episodes < 1:
-        raise InputError(f"--episodes is {episodes}; at least one is needed")
     rows: list[ResultRow] = []
     if isinstance(read_run(run), RLRecord) and "last" in checkpoints:
         checkpoints = ("last",)

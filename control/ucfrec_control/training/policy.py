@@ -32,7 +32,8 @@ class ControlPolicy:
         Args:
             target: target return of an episode; None for that of the preset, else the largest of
                 the training trajectories.
-            checkpoint: `last`, or `best` for the lowest validation loss.
+            checkpoint: `last`, `best` for the lowest validation loss, or `return` for the highest
+                return where the training selected by it.
 
         Raises:
             InputError: `run` is not such a run, or its training has not ended.

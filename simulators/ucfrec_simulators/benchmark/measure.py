@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any, Final
 
-from ucfrec.benchmark.cells import Cell, Measurement, open_store
+from ucfrec.benchmark.cells import Cell, Measurement, describe_updates, open_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import claim
@@ -52,7 +52,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
             checkpoint=CHECKPOINT,
             rule=f"{rule} ({rule.hash})",
             target_return=target,
-            details={},
+            details=describe_updates(cell),
         )
         rows.append(row.extended(training_metrics))
     return rows

@@ -44,7 +44,7 @@ PAPER: Final[Mapping[str, Method]] = {
         ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0"),
     ),
 }
-"""UCF with the paper's losses and generator, with Appendix H's copies and with Algorithm 5's."""
+"""UCF as read in the paper, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Final[Mapping[str, Method]] = {
     "popular": _simple("popular"),
     "item-rate": _simple("item-rate", vectors=False),
@@ -102,7 +102,8 @@ that is NX_10: all its sessions have the same length, so early exits do not hide
 effect."""
 BUDGETS: Final[Mapping[str, Budget]] = {
     # Sized for two cores: smaller width, fewer steps, smaller logs, fewer tasks beside those of the
-    # main table, and cheaper settings of two baselines; methods and seeds are not reduced.
+    # main table, cheaper settings of two baselines, of the paper's settings only the steps; methods
+    # and seeds are not reduced.
     "small": Budget(
         name="small",
         seeds=3,

@@ -153,13 +153,10 @@ def _available(name: str) -> bool:
 
 
 def _settings(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
-    """Settings of a training over the defaults."""
+    """Settings of a training over the defaults; of methods with the paper's settings only the
+    number of updates is the budget's."""
+    if name in PAPER:
+        return budget.shorten(method)
     memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
     settings = budget.of_policies.get(method.policy, ())
-    return (
-        *budget.settings,
-        *memory,
-        *settings,
-        *method.settings,
-        *budget.of_methods.get(name, ()),
-    )
+    return (*budget.settings, *memory, *settings, *method.settings)

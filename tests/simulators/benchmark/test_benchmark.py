@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
-from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
+from ucfrec.benchmark.cells import Budget, Evaluation, describe_updates, make_key, training_config
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
@@ -23,6 +23,7 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
 from ucfrec.results.rows import ResultRow, append_rows, read_rows
+from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RUN, read_record
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
@@ -39,6 +40,7 @@ def planned(folder: Path, budget: Budget, **request: Any) -> RecommendationCells
     return RecommendationCells(given, budget)
 
 
+UPDATES = "the paper's settings, 0.02% of its updates"
 SETTINGS = ("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1")
 FEW = {"evaluation": Evaluation(episodes=8, seed=1_000_000), "settings": SETTINGS}
 TINY = replace(BUDGETS["small"], seeds=2, logs=1, sessions=60, **FEW)
@@ -153,6 +155,12 @@ def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
     for cells in tables.values():
         paper = [cell for cell in cells if cell.method == "ucf-paper"]
         assert {cell.task for cell in paper} == {cell.task for cell in cells}
+        for cell in paper:
+            assert describe_updates(cell) == {"updates": UPDATES}
+            assert cell.config.train.steps == 2
+            length = replace(cell.config.train, steps=10_000, warmup_steps=500, validate_every=500)
+            assert replace(cell.config, train=length) == resolve_config("ucf-paper")
+    assert BUDGETS["full"].shorten(METHODS["ucf-paper"])[0] == "train.steps=10000", "not longer"
 
 
 @pytest.mark.usefixtures("no_data")
@@ -195,9 +203,12 @@ def test_show_only_measures_nothing(tmp_path: Path, capsys: pytest.CaptureFixtur
     arguments = ["benchmark", "recommendation", "--show-only", "--results", str(path)]
     assert main(arguments) == 2
     assert "rows.jsonl has no rows of recommendation, main" in capsys.readouterr().err
-    append_rows(path, [result_row(10.0), result_row(20.0), result_row(3.0, training_seed=1)])
+    paper = result_row(3.0, training_seed=1).extended({"updates": UPDATES})
+    append_rows(path, [result_row(10.0), result_row(20.0), paper])
     assert main(arguments) == 0
-    assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
+    printed = capsys.readouterr().out
+    assert "| w | m | 2 | 11.5 ± 12 |" in printed, "the last of a seed counts"
+    assert f"\n\nucf-paper…: {UPDATES}\n" in printed
     assert main(["benchmark", "recommendation", "--out", "out", "--table", "table-2"]) == 2
     assert "no table is called table-2; there are main, shared, dist" in capsys.readouterr().err
 
@@ -242,7 +253,6 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
     [
         ({"methods": ["dt", "nothing"]}, "no method is called nothing"),
         ({"tasks": ["nowhere"]}, "no task is called nowhere"),
-        ({"training_seeds": 0}, "0 training seeds are requested"),
         ({"budget": "huge"}, "no budget is called huge"),
     ],
 )

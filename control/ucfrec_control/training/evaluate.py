@@ -27,6 +27,7 @@ from ucfrec_control.environments.environments import (
 )
 from ucfrec_control.environments.scores import find_kind, find_task, normalise
 from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, read_run
+from ucfrec_control.training.screening import Screening
 from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
@@ -153,9 +154,10 @@ def open_environment(
 
 def method_of(record: RunRecord | RLRecord) -> str:
     """Name of the method of a run, with a suffix for how screening treated what it flagged."""
-    if record.screening is None or not record.screening.flagged:
+    screening = Screening.of(record)
+    if screening is None or not screening.flagged:
         return record.name
-    return record.name + _SUFFIXES[record.screening.how]
+    return record.name + _SUFFIXES[screening.how]
 
 
 def takes_target(record: RunRecord | RLRecord) -> bool:

@@ -88,7 +88,6 @@ class RLRecord(TrainingRecord):
     threads: int
     dropped_observations: tuple[int, ...] = ()
     augmentation: None = None
-    screening: None = None
 
     @property
     def name(self) -> str:

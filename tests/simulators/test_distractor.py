@@ -16,7 +16,6 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import reward_bit
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -111,14 +110,10 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
         DistractorEnv(plain, 2.0)
 
 
-def test_gymnasium_accepts_it_and_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
+@pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
+def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
     folder = kuairand_folder / "environment"
-    for name in ("synthetic-taobao-distractor", "kuairand-distractor-on"):
-        check_environment(Environment(name, folder).simulator().make(1, folder))
-    for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
-        environments = (Environment(n, folder) for n in (name, f"{name}-distractor-on"))
-        plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in environments)
-        assert plain == distractor
+    check_environment(DistractorEnvironment(name, folder, 1.0).simulator().make(1, folder))
 
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])

@@ -88,6 +88,8 @@ class TrainingRecord(Record):
     """Of packages."""
     wall_time_s: Number
     """Of all stages, resumptions included."""
+    dropped_observations: tuple[Count, ...] = ()
+    """Columns of the logged observation that the policy does not see, ascending."""
     extra: dict[Text, Any] = Field(default_factory=dict)
     """Entries of the program that trained it, which `ucfrec` keeps and does not read."""
 
@@ -181,8 +183,6 @@ class RunRecord(TrainingRecord):
     """Mean negative log-likelihood (nats) of the logged items over all validation steps: `uniform`
     if all are equally probable, `popularity` if their probability is their share of the training
     steps, with one added to every count. None if actions are vectors."""
-    dropped_observations: tuple[Count, ...] = ()
-    """Columns of the logged observation that the policy does not see, ascending."""
     refit_of: dict[str, Any] | None = None
     """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
     update: Update | None = None

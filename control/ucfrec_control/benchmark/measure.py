@@ -20,7 +20,7 @@ from ucfrec_control.training.rl_baselines import (
     rl_config,
     train_rl,
 )
-from ucfrec_control.training.screening import SCREENING, Screening
+from ucfrec_control.training.screening import SCREENING, read_screening
 from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 PRESET_STEPS: Final = 100_000
@@ -101,7 +101,7 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     values = (0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0)
     evaluations = [evaluate(cell, checkpoints=("last",), distractor=v)[0] for v in values]
     more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **describe_updates(cell)}
-    if (screening := Screening.of(record)) is not None:
+    if (screening := read_screening(record)) is not None:
         more[SCREENING] = verdicts(screening.dimensions, store)
     return [evaluations[0].of(row_key).extended(more)]
 

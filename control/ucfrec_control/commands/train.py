@@ -10,7 +10,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.environments.environments import environment_of_data
-from ucfrec_control.training.screening import Screening
+from ucfrec_control.training.screening import read_screening
 from ucfrec_control.training.selection import select_by_return
 from ucfrec_control.training.train import (
     control_policies,
@@ -46,7 +46,7 @@ class Train(TrainingOptions):
             callbacks = select_by_return(self.out, env_id, self.select_by_return)
         record = train_control(store, self.out, config, screening=self.screen, callbacks=callbacks)
         print(record.describe())
-        if (screening := Screening.of(record)) is not None:
+        if (screening := read_screening(record)) is not None:
             flagged = ", ".join(map(str, screening.flagged)) or "none"
             print(f"screening     observation columns without effect: {flagged}")
         print(describe_returns(store))

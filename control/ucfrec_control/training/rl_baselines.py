@@ -86,7 +86,6 @@ class RLRecord(TrainingRecord):
     config: RLRun
     policy: RLFit | None = None
     threads: int
-    dropped_observations: tuple[int, ...] = ()
     augmentation: None = None
 
     @property

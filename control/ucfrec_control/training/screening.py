@@ -26,7 +26,7 @@ process that goes on, such as a position, is explained by other dimensions (3).
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,8 +41,8 @@ from ucfrec.runs.record import TrainingRecord
 from ucfrec.runs.start import training_views
 from ucfrec.user_model.reward_report import draw_numbers
 
-SCREENING: Final = "screening"
-"""Entry of what a run records beside what `ucfrec` does."""
+SCREENING, TREATMENT = "screening", "treatment"
+"""Extra entries of a run's record: the report, and what was done about it, "drop" or "copies"."""
 _CHUNK = 1024
 _HELPED = 3
 _CLIP = 10.0
@@ -145,23 +145,10 @@ class ScreeningReport:
         return "\n".join([*lines, "", f"dimensions without effect: {flagged}"])
 
 
-@dataclass(frozen=True)
-class Screening(ScreeningReport):
-    """The report of a run, and what was done about it."""
-
-    how: str
-    """`screening` of `ucfrec_control.training.train.train_control`."""
-
-    @classmethod
-    def of(cls, record: TrainingRecord) -> Self | None:
-        """What a run recorded; None if it was not screened."""
-        entry = record.extra.get(SCREENING)
-        return None if entry is None else cls.from_json(entry)
-
-    @classmethod
-    def from_json(cls, entry: Any) -> Self:
-        """Of the JSON object of a screening."""
-        return TypeAdapter(cls).validate_python(entry)
+def read_screening(record: TrainingRecord) -> ScreeningReport | None:
+    """What the screening before a training found; None if there was none."""
+    report = record.extra.get(SCREENING)
+    return None if report is None else TypeAdapter(ScreeningReport).validate_python(report)
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes
@@ -23,7 +24,13 @@ from ucfrec.runs.run import share_stage, train_run
 from ucfrec.runs.start import training_views
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
-from ucfrec_control.training.screening import SCREENING, Screening, screen_store
+from ucfrec_control.training.screening import (
+    SCREENING,
+    TREATMENT,
+    ScreeningReport,
+    read_screening,
+    screen_store,
+)
 
 _POLICIES: Final = ("ucf", "ucf-paper", "dt", "dc", "lsdt", "bc")
 """Built-in policies whose actions may be vectors."""
@@ -127,8 +134,8 @@ def train_control(
     entries: dict[str, Any] = {"versions": versions(PACKAGES)}
     report = None
     if (out / RUN).exists():
-        report = Screening.of(read_record(out))
-        started_with = report and report.how
+        record = read_record(out)
+        report, started_with = read_screening(record), record.extra.get(TREATMENT)
         if started_with != screening:
             option = f" --screen {started_with}" if started_with else "out --screen"
             raise InputError(
@@ -137,14 +144,14 @@ def train_control(
             )
     if screening is None:
         return train_run(store, out, config, entries, shared=shared, callbacks=callbacks)
-    report = report or _screen_once(store, screening, shared)
+    report = report or _screen_once(store, shared)
     if len(report.flagged) == store.state_size:
         raise InputError(
             f"{store.path}: screening found no effect of any of the {store.state_size} state "
             "dimensions; the log has too few steps, or too noisy ones, to decide: train without "
             "--screen"
         )
-    entries["extra"] = {SCREENING: asdict(report)}
+    entries["extra"] = {TREATMENT: screening, SCREENING: asdict(report)}
     if screening == "drop":
         entries["dropped_observations"] = report.flagged
         selected = store.without_observation_dimensions(report.flagged)
@@ -154,7 +161,7 @@ def train_control(
     return train_run(store, out, config, entries, more, shared=shared, callbacks=callbacks)
 
 
-def _screen_once(store: EpisodeStore, how: str, shared: Path | None) -> Screening:
+def _screen_once(store: EpisodeStore, shared: Path | None) -> ScreeningReport:
     """Screen a store, once for all runs that share stages."""
     inputs = {"screened": store.record.fingerprint, "steps": store.n_steps, "seed": _SEED}
     with TemporaryDirectory() as scratch:
@@ -164,7 +171,7 @@ def _screen_once(store: EpisodeStore, how: str, shared: Path | None) -> Screenin
             write_json(file, asdict(screen_store(store, _SEED)))
 
         share_stage(shared, inputs, screen_store.__module__, file.parent, (file.name,), make)
-        return Screening.from_json({"how": how, **read_json(file)})
+        return TypeAdapter(ScreeningReport).validate_python(read_json(file))
 
 
 def make_interventions(

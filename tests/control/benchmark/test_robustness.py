@@ -26,7 +26,7 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.training.evaluate import evaluate_run
-from ucfrec_control.training.screening import Screening, ScreeningConfig, screen_states
+from ucfrec_control.training.screening import ScreeningConfig, read_screening, screen_states
 from ucfrec_control.training.train import train_control
 
 
@@ -138,16 +138,16 @@ def test_screening_is_recorded_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     command = ("train", store, "--out", run, "--policy", "bc", "--screen", "copies")
     command += tuple(set_options(("train.steps=2", "policy.dim=8")))
     printed = control(*command)[0]
-    screening = Screening.of(RunRecord.read(run))
+    screening = read_screening(RunRecord.read(run))
     assert 4 in screening.flagged
     said = ", ".join(map(str, screening.flagged))
     assert f"columns without effect: {said}\n" in printed
     control(*command)
-    assert Screening.of(RunRecord.read(run)) == screening
+    assert read_screening(RunRecord.read(run)) == screening
     report = tmp_path / "report.json"
     assert screening.describe() in control("screen", store, "--json", report)[0]
     recorded = read_json(run / "run.json")["extra"]["screening"]
-    assert {**read_json(report), "how": "copies"}.items() >= recorded.items()
+    assert read_json(report).items() >= recorded.items()
 
 
 @pytest.mark.slow

@@ -21,10 +21,11 @@ from ucfrec.runs.refit import refit
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.training import train
 from ucfrec_control.training.screening import (
+    TREATMENT,
     DimensionReport,
-    Screening,
     ScreeningConfig,
     ScreeningReport,
+    read_screening,
     screen_states,
 )
 from ucfrec_control.training.train import make_interventions, train_control
@@ -124,13 +125,13 @@ def test_a_run_goes_on_as_it_was_started_and_is_refitted_so(tmp_path: Path) -> N
     record = train_control(store, tmp_path / "run", config, screening="drop")
     again = train_control(store, tmp_path / "run", config, screening="drop")
     assert again.policy == record.policy
-    assert Screening.of(again) == Screening.of(record)
+    assert read_screening(again) == read_screening(record)
     for other in ("copies", None):
         with pytest.raises(InputError, match="was started with --screen drop"):
             train_control(store, tmp_path / "run", config, screening=other)
     whole = refit(store, tmp_path / "run", tmp_path / "whole")
     assert (whole.sizes, whole.dropped_observations) == (record.sizes, FLAGGED)
-    assert Screening.of(whole) == Screening.of(record)
+    assert read_screening(whole) == read_screening(record)
 
 
 def test_runs_that_share_stages_are_screened_once(
@@ -149,9 +150,9 @@ def test_runs_that_share_stages_are_screened_once(
         config = resolve_config("bc", None, SETTINGS, seed)
         out = tmp_path / f"{store.path.name}-{how}-{seed}"
         record = train_control(store, out, config, screening=how, shared=tmp_path / "stages")
-        reports.append(Screening.of(record))
+        reports.append((record.extra[TREATMENT], read_screening(record)))
     assert screened_stores == [(store.path, 0) for store in stores]
-    assert [report.how for report in reports[:3]] == ["copies", "copies", "drop"]
+    assert [how for how, _ in reports[:3]] == ["copies", "copies", "drop"]
     assert reports[0] == reports[1]
     record = RunRecord.read(tmp_path / "30-copies-0")
     assert (record.dropped_observations, record.sizes["state"]) == ((), stores[0].state_size)

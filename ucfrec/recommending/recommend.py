@@ -268,7 +268,7 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
                 f"histories have {size}"
             )
         context = trained.policy.config.context
-        observations = torch.from_numpy(logged).unsqueeze(1).expand(-1, context, -1)
+        observations = torch.tensor(logged).unsqueeze(1).expand(-1, context, -1)
     users = trained.users.numbers(histories.users)
     rows, rewards = histories.item_ids, histories.rewards
     return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)

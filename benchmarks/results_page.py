@@ -29,6 +29,8 @@ from ucfrec.benchmark.tables import (
 from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.results.rows import ResultRow, latest, read_rows
 from ucfrec.results.statistics import Summary, grouped, summary
+from ucfrec_control.benchmark.robustness import SHOWN as DROPS
+from ucfrec_control.benchmark.robustness import drops, largest_drops
 
 ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
@@ -324,29 +326,16 @@ def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> s
 
 def robustness(rows: Sequence[ResultRow]) -> str:
     """The largest loss of each method, then the score and the loss in every case."""
-    clean = {
-        (row.task, row.method, row.training_seed): row.value
-        for row in rows
-        if row.conditions["distractor"] == "none"
-    }
-    lines, losses = [], {}
-    planted = [row for row in rows if row.conditions["distractor"] != "none"]
-    cases = grouped(planted, lambda row: (row.method, row.task, row.conditions["distractor"]))
+    lines = []
+    cases = grouped(drops(rows), lambda line: (line["method"], line["task"], line["distractor"]))
     for (method, task, kind), own in cases.items():
-        starts = [clean[row.task, row.method, row.training_seed] for row in own]
-        ends = [[row.metrics[name] for row in own] for name in ("score", "score_at_one")]
-        lost = [
-            summary(100 * (1 - end / start) for end, start in zip(each, starts, strict=True))
-            for each in ends
-        ]
-        losses[method, task, kind] = [each.mean for each in lost]
-        cells = [level(summary(each)) for each in (starts, *ends)]
-        told = [rounded(each.mean, most=1) for each in lost]
-        lines.append((task.removesuffix("-zoo"), kind, method, *cells, *told))
-    of_methods = grouped(losses.items(), lambda item: item[0][0])
+        samples = {name: summary(line[name] for line in own) for name in DROPS}
+        cells = [level(samples[name]) for name in ("clean", "score", "score_at_one")]
+        lost = [rounded(samples[name].mean, most=1) for name in ("drop", "drop_at_one")]
+        lines.append((task.removesuffix("-zoo"), kind, method, *cells, *lost))
     largest = [
-        (method, *(rounded(max(each[at] for _, each in own), most=1) for at in (0, 1)))
-        for method, own in of_methods.items()
+        (line["method"], *(rounded(line[at], most=1) for at in ("at 0", "at 1")))
+        for line in largest_drops(rows)
     ]
     head = ("file", "distractor", "method", "without", "at 0", "at 1", "lost at 0, %", "at 1, %")
     parts = [
@@ -496,8 +485,8 @@ SECTIONS = (
     ),
     Section(
         "A misleading column",
-        "A planted observation that agrees with the reward in the log and has no effect. Dropping "
-        "what screening flags (`ucf-dropped`) loses nothing; UCF itself loses up to 65%.",
+        "A planted observation that agrees with the reward in the log and has no effect. UCF loses "
+        "up to 65%.",
         f"`{RUN} distractor`",
         of("recommendation", "distractor"),
         distractor,
@@ -597,7 +586,7 @@ NAMES = (
         "the paper's losses and generator, at the budget's width, batch and rate; `-algorithm-5` "
         "edits states as its Algorithm 5 says",
     ),
-    ("ucf-screened, -dropped", "interventions on the columns that screening flags; without them"),
+    ("ucf-screened, -dropped", "interventions on dimensions that screening flags; without them"),
     ("-wo-exposure, -wo-rule", "without exposure features; without a selected rule"),
     ("-actions, -both", "augmented actions; augmented states and actions"),
     ("-weights, -max-return", "advantage weights; the largest expected return as target"),

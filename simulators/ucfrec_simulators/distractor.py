@@ -5,9 +5,7 @@ numbers of an environment's observation as its logs had, and KuaiRand's logs hav
 distractor.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,15 +14,11 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ucfrec.acting.rollout import Actor, Informed
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import read_observations, reward_bit, write_observations
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
-from ucfrec_simulators.kuai import kuairand
-from ucfrec_simulators.session_env import AnyEnv
-from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 
 OFF: Final = 0.0
 ON: Final = 1.0
@@ -101,47 +95,6 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
         return np.column_stack([distractors, observations]).astype(np.float32)
 
 
-class WithoutDistractor:
-    """A behavior policy of the wrapped environment; it reads observations without the
-    distractor."""
-
-    def __init__(self, actor: Actor) -> None:
-        self._actor = actor
-        self.begin, self.observe = actor.begin, actor.observe
-
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
-        """Act on observations (N, 1 + O) with the distractor removed."""
-        return self._actor.act(observations[:, 1:], live)
-
-    def inform(self, info: Mapping[str, Any]) -> None:
-        """Pass the environment's `info` to the policy, if it reads it."""
-        if isinstance(self._actor, Informed):
-            self._actor.inform(info)
-
-
-def with_distractor(simulator: Simulator, rate: float) -> Simulator:
-    """The simulator with a distractor that is on with probability `rate` in its environment."""
-
-    def hide_distractor(
-        behavior: Callable[[AnyEnv, int], Actor],
-        env: AnyEnv,
-        seed: int,
-    ) -> WithoutDistractor:
-        assert isinstance(env, DistractorEnv)
-        return WithoutDistractor(behavior(env.env, seed))
-
-    state = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
-    return replace(
-        simulator,
-        summary=f"{simulator.summary}; with a distractor, {state}",
-        make=lambda num_envs, folder: DistractorEnv(simulator.make(num_envs, folder), rate),
-        behaviors={
-            name: partial(hide_distractor, behavior)
-            for name, behavior in simulator.behaviors.items()
-        },
-    )
-
-
 @dataclass(frozen=True)
 class DistractorEnvironment(Environment):
     """A named environment with a distractor added, for `ucfrec.evaluation.evaluate`."""
@@ -150,11 +103,11 @@ class DistractorEnvironment(Environment):
     """Probability that the distractor is on in a step."""
 
     def simulator(self) -> Simulator:
-        """Load the simulator of this name, with the distractor added."""
-        return with_distractor(super().simulator(), self.rate)
+        """Load the simulator of this name, with the distractor added. It has no behavior policies,
+        which would read the distractor."""
+        plain = super().simulator()
 
+        def make(sessions: int, folder: Path | None) -> DistractorEnv:
+            return DistractorEnv(plain.make(sessions, folder), self.rate)
 
-SYNTHETIC_TAOBAO: Final = with_distractor(synthetic_taobao.SIMULATOR, OFF)
-SYNTHETIC_TAOBAO_ON: Final = with_distractor(synthetic_taobao.SIMULATOR, ON)
-KUAIRAND: Final = with_distractor(kuairand.SIMULATOR, OFF)
-KUAIRAND_ON: Final = with_distractor(kuairand.SIMULATOR, ON)
+        return replace(plain, make=make, behaviors={})

@@ -14,7 +14,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from tests.support.markdown import ROOT
-from ucfrec import EpisodeStore, Recommender
+from ucfrec import Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.commands.train import settings_text
@@ -26,12 +26,10 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.ab_test import compare_arms
 from ucfrec.plugins import load_plugin
-from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, ResultTable, latest, read_results
 from ucfrec.runs.config import settings_given
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.record import verify_run
-from ucfrec.runs.screened import screen_store
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import Search
 from ucfrec.tuning.study import Plan, tune
@@ -189,12 +187,6 @@ ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
             shutil.rmtree("new/store"),
         ),
     ),
-    "screen": (
-        f"screen {STORE} --seed 1 --json out",
-        lambda _: write_json(
-            Path("out"), asdict(screen_store(EpisodeStore.open(STORE), 1)) | provenance()
-        ),
-    ),
     "settings": (
         "settings --policy dt",
         lambda _: print(settings_text("dt", shutil.get_terminal_size().columns)),
@@ -299,7 +291,7 @@ def _content(path: Path) -> object:
         return path.read_bytes()
     if path.name == "out":
         text = path.read_text()
-        return _numbers(path) if text.startswith("[") else text.replace("ucfrec screen", "")
+        return _numbers(path) if text.startswith("[") else text
     return path.read_text() if path.suffix == ".md" else None
 
 

@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.support.causes import planted_vectors
 from tests.support.planted import ACTION, CONSTANT, STATE, STEPS, f, fitted, planted, planted_store
 from ucfrec import schema
 from ucfrec.arrays import Float32Array
@@ -28,7 +27,6 @@ from ucfrec.counterfactual.augmentation import (
     accept,
     augment_episodes,
     edit_states,
-    interventions,
     read_actions,
 )
 from ucfrec.counterfactual.generators import (
@@ -41,7 +39,7 @@ from ucfrec.counterfactual.generators import (
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions
+from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 ALGORITHM_5 = AugmentConfig(copies=4, edits_per_copy=1, reward_quantile=0.0)
@@ -361,25 +359,3 @@ def test_additive_effects_read_the_other_item_where_it_would_be_shown(tmp_path: 
         torch.testing.assert_close(copied.actions[copy], shown.actions[0])
         # What was not known before the step is not in its state.
         assert torch.equal(shown.states, store.transitions(episode, step).states)
-
-
-def test_interventions_change_the_flagged_dimensions_alone(tmp_path: Path) -> None:
-    store = planted_vectors(tmp_path / "store", trajectories=20, length=30)
-    train = store.split("train")
-    made = interventions(train, [1, 4], seed=5)
-    union = TrainingEpisodes(train, made)
-    n = train.n_episodes
-    assert union.n_steps == 3 * train.n_steps
-    windows = union.windows(np.arange(3 * n), np.tile(train.lengths - 1, 3), 30)
-    factual, held, redrawn = windows.states.chunk(3)
-    for copy in (held, redrawn):
-        assert torch.equal(copy[..., [0, 2, 3]], factual[..., [0, 2, 3]])
-    assert torch.equal(held[:, 1:, [1, 4]], held[:, :-1, [1, 4]])
-    assert (redrawn[:, 1:, 4] != redrawn[:, :-1, 4]).float().mean() > 0.9
-    # Jointly from the marginal: every pair of values is some step's own.
-    pairs = {tuple(pair) for pair in factual[..., [1, 4]].reshape(-1, 2).tolist()}
-    drawn = redrawn[..., [1, 4]].reshape(-1, 2)
-    assert all(tuple(pair) in pairs for pair in drawn.tolist())
-    assert abs(np.corrcoef(drawn[:, 0], factual[..., 1].reshape(-1))[0, 1]) < 0.15
-    again = interventions(train, [1, 4], seed=5)
-    np.testing.assert_array_equal(again.edit_state, made.edit_state)

@@ -6,7 +6,6 @@ from tests.support.logs import store_of
 from tests.support.served import OBSERVED, SETTINGS, observed_log, trained_run
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -16,10 +15,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
 
 
 @pytest.fixture(scope="module")
-def screened(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    """A run that does not see the first of the two logged columns of observations."""
-    folder, options = tmp_path_factory.mktemp("screened"), {"gap_minutes": 120, "embedding_size": 6}
+def observing(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    """A run that sees the two logged columns of observations."""
+    folder, options = (
+        tmp_path_factory.mktemp("observing"),
+        {"gap_minutes": 120, "embedding_size": 6},
+    )
     store = store_of(observed_log(), folder, OBSERVED, reward="reward", session_by="gap", **options)
-    config, about = resolve_config("dt", None, SETTINGS), {"dropped_observations": (0,)}
-    train_run(drop_columns(store, (0,)), folder / "run", config, about)
+    train_run(store, folder / "run", resolve_config("dt", None, SETTINGS))
     return TrainedPolicy.load(folder / "run")

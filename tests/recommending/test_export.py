@@ -38,12 +38,12 @@ from ucfrec.recommending.export import (
     GRAPH,
     OUTPUTS,
     _run_graph,
-    _start_runner,
-    _write_graph,
     export,
     find_best,
     measure_magnitude,
     require_close,
+    start_runner,
+    write_graph,
 )
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
@@ -89,9 +89,7 @@ def ranked(
             seen = [item_of[item] for item in batch.seen_ids[batch.seen_owner == number].tolist()]
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
-                dropped = description.get("dropped_observations", [])
-                seen_by_policy = np.delete(batch.observations[number], dropped)
-                rows["observations"].append([seen_by_policy] * context)
+                rows["observations"].append([batch.observations[number]] * context)
             users.append(user)
     dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
     given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
@@ -137,12 +135,10 @@ def test_the_graph_recommends_what_the_policy_does(
         agree(tmp_path / "out", given, some, LogMapping(), rule)
 
 
-def test_a_graph_has_the_observations_that_screening_kept(
-    screened: TrainedPolicy, tmp_path: Path
-) -> None:
+def test_a_graph_has_observations(observing: TrainedPolicy, tmp_path: Path) -> None:
     rule = DecisionRule(3.0, 1.0, reward_weight=0.7)
-    export(screened, tmp_path / "out", rule=rule, k=20)
-    agree(tmp_path / "out", screened, observed_log(histories()), OBSERVED, rule)
+    export(observing, tmp_path / "out", rule=rule, k=20)
+    agree(tmp_path / "out", observing, observed_log(histories()), OBSERVED, rule)
 
 
 @pytest.fixture
@@ -214,8 +210,8 @@ def test_the_graph_finds_the_best_in_the_order_of_recommend(tmp_path: Path) -> N
     scores = torch.randn(4, 1000, generator=torch.Generator().manual_seed(0))
     scores[1], scores[2, 5:] = -torch.inf, -torch.inf
     scores[3] = (scores[3] / 2).round()  # many are equal
-    _write_graph(_Best(), {"scores": scores}, tmp_path / GRAPH, ["best", "values"], "", "")
-    best, values = _run_graph(_start_runner(tmp_path / GRAPH), {"scores": scores})
+    write_graph(_Best(), {"scores": scores}, tmp_path / GRAPH, ["best", "values"], "", "")
+    best, values = _run_graph(start_runner(tmp_path / GRAPH), {"scores": scores})
     assert best.tolist()[::3] == best_items(scores[::3], 9).tolist()
     expected = scores[0].log_softmax(-1).topk(9)
     torch.testing.assert_close(torch.from_numpy(values[0]), expected.values)

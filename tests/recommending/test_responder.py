@@ -72,10 +72,10 @@ def test_answers_are_those_of_recommend(
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
-def test_requests_give_the_observations_that_logs_have(screened: TrainedPolicy) -> None:
+def test_requests_give_the_observations_that_logs_have(observing: TrainedPolicy) -> None:
     log = observed_log(histories())
-    found = answered(responder(screened, k=24), requests_of(log))
-    expected = recommended(screened, log, 24)
+    found = answered(responder(observing, k=24), requests_of(log))
+    expected = recommended(observing, log, 24)
     pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 

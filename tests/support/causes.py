@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.store import EpisodeStore
 
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 
@@ -68,31 +66,3 @@ def planted_category(
     rewards += noise * np.random.default_rng(1).normal(size=shape)
     states[:, :, 6] = rewards > np.median(rewards)
     return written(out, states, actions, rewards)
-
-
-COLUMNS = ("bit", "seen by the policy", "not seen", "user", "early bit")
-"""Observation columns of `planted_items`."""
-
-
-def planted_items(
-    out: Path, sessions: int = 400, length: int = 12, flip: float = 0.0
-) -> EpisodeStore:
-    """Clicks on eight items. Column 0 is the click itself, wrong in the share `flip`, column 4 the
-    next step's. Columns 1 and 2 raise and lower what some items are clicked, drawn again at every
-    step; the logging policy prefers the right items by column 1 only. Column 3 is the user's."""
-    rng = np.random.default_rng(0)
-    n, items = sessions * length, 8
-    seen, unseen = rng.integers(2, size=n), rng.integers(2, size=n)
-    user = rng.integers(2, size=sessions).repeat(length)
-    liked = np.where(seen == 1, 1, 5) % items
-    played = np.where(rng.random(n) < 0.4, liked, rng.integers(items, size=n))
-    odds = -1.5 + 1.2 * (played % 2) + 1.5 * (played == liked) + 1.0 * unseen * (played > 3)
-    odds += 0.8 * (user == played % 2)
-    clicks = (rng.random(n) < 1 / (1 + np.exp(-odds))).astype(np.float32)
-    bit = np.logical_xor(clicks == 1, rng.random(n) < flip)
-    early = np.where(np.arange(n) % length < length - 1, np.roll(clicks, -1), clicks)
-    observed = np.column_stack([bit, seen, unseen, user, early]).astype(np.float32)
-    columns = {schema.ITEM: played, schema.REWARD: clicks, schema.OBSERVATION: observed}
-    store = EpisodeStore.write(out, columns, np.full(sessions, length), source=SOURCE)
-    ItemStates(torch.eye(items), torch.zeros(0, 0), 0.0, 1.0).save(out / ITEM_STATES)
-    return EpisodeStore.open(store.path)

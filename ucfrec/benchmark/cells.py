@@ -12,7 +12,6 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.provenance import config_hash
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.screened import SCREENING
 
 Presets = Mapping[str, Mapping[str, Any]]
 """Defaults of settings, by table."""
@@ -37,8 +36,8 @@ class Method:
     """Whether it also supports action vectors; False for policies of items only."""
     tags: bool = False
     """Whether it supports only items with tags."""
-    screening: str | None = None
-    """One of `ucfrec.runs.screened.SCREENINGS` for logs with observations; None for none."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """What the benchmark itself does in a training, beside the settings of the policy."""
 
     def supports(self, store: EpisodeStore) -> bool:
         """Whether it can be trained on the actions of `store`."""
@@ -178,7 +177,8 @@ class Cell:
     presets: Presets = field(default_factory=dict)
     """Defaults of the training for its data, below `settings`."""
     conditioned: bool = False
-    screening: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+    """As `Method.options`."""
     conditions: Mapping[str, Scalar] = field(default_factory=dict)
     """Conditions of its rows beside the budget and the number of episodes."""
 
@@ -214,10 +214,7 @@ def training_config(cell: Cell) -> dict[str, Any] | None:
     """The configuration of the cell's training; None for a built-in policy."""
     if cell.store is None:
         return None
-    config = asdict(cell.config)
-    if cell.screening is not None:
-        config[SCREENING] = cell.screening
-    return config
+    return {**asdict(cell.config), **cell.options}
 
 
 def open_store(cell: Cell) -> EpisodeStore:
@@ -268,8 +265,7 @@ class Plan:
                 "policy": method.policy,
                 "settings": self.settings(name, method),
                 "presets": self.presets(store, method.policy),
-                # Where nothing but items was logged, there are no columns to screen.
-                "screening": method.screening if store.observation_size else None,
+                "options": method.options,
             }
             digest = config_hash({**training, "data": store.record.fingerprint})
             place = folder_name("-".join([task.name, *map(str, task.conditions.values())]))

@@ -1,5 +1,5 @@
-"""`ucfrec train`: train a policy on an episode store; `settings` lists its settings, `tune` and
-`screen` choose them and columns."""
+"""`ucfrec train`: train a policy on an episode store; `settings` lists its settings, `tune`
+chooses them."""
 
 import inspect
 import json
@@ -42,9 +42,6 @@ class TrainingOptions(Table):
     """Seed of weights and batches."""
     threads: Annotated[int | None, POSITIVE] = None
     """CPU threads (default: all cores)"""
-    screen: Literal["drop", "copies"] | None = None
-    """What to do with observation columns without effect; train without them, or add copies of the
-    sessions that intervene on them (default: not screened)"""
 
 
 class Train(TrainingOptions):
@@ -82,11 +79,10 @@ class Train(TrainingOptions):
                 evidence = [] if self.evidence is None else [f"rule.evidence={self.evidence}"]
                 settings = [*self.set, *evidence]
                 config = resolve_config(self.policy, self.config, settings, self.seed)
-                record = train_policy(store, self.out, config, self.screen, not self.no_refit)
-            elif self.config or self.set or self.screen or self.evidence is not None:
+                record = train_policy(store, self.out, config, not self.no_refit)
+            elif self.config or self.set or self.evidence is not None:
                 raise InputError(
-                    "--refit takes all settings of the run; omit --config, --set, --screen and "
-                    "--evidence"
+                    "--refit takes all settings of the run; omit --config, --set and --evidence"
                 )
             else:
                 record = refit(store, self.refit, self.out)
@@ -191,31 +187,6 @@ class Tune(Table):
             f"next: ucfrec ope {quote(str(self.out / BEST))}, its value on the test split, which "
             "no trial has seen"
         )
-
-
-class Screen(Table):
-    """`ucfrec screen`."""
-
-    store: Annotated[Path, ARGUMENT, INPUT_FOLDER, "STORE"]
-    """Episode store to screen."""
-    seed: int = 0
-    """Seed of the predictors."""
-    json: Annotated[Path | None, "FILE"] = None
-    """Write the report here (default: none)"""
-
-    def execute(self) -> None:
-        """Print which logged observation columns have no effect."""
-        from dataclasses import asdict
-
-        from ucfrec.episodes.store import EpisodeStore
-        from ucfrec.files.atomic import write_json
-        from ucfrec.provenance import provenance
-        from ucfrec.runs.screened import screen_store
-
-        report = screen_store(EpisodeStore.open(self.store), self.seed)
-        print(report.describe())
-        if self.json is not None:
-            write_json(self.json, asdict(report) | provenance())
 
 
 class Settings(Table):

@@ -4,7 +4,7 @@ another action and its counterfactual reward."""
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -418,25 +418,6 @@ def _report(
         verdict=verdict,
         warnings=tuple(filter(None, warnings)),
         reward_model=crm_report,
-    )
-
-
-def interventions(view: EpisodeStore, dimensions: Sequence[int], seed: int) -> AugmentedEpisodes:
-    """Two copies of every episode of `view` under do(d ~ marginal), d being `dimensions`: values
-    are drawn, jointly, from its steps, for the first copy once an episode, then at every step."""
-    rng = np.random.default_rng(seed)
-    episodes, steps = view.all_steps()
-    states = view.windows(episodes, steps, 1).states[:, 0].numpy()
-    once, _ = rng.integers(len(steps), size=(2, view.n_episodes))
-    always = rng.integers(len(steps), size=len(steps))
-    edited, columns = np.stack([states, states]), list(dimensions)
-    edited[0][:, columns] = states[once[episodes]][:, columns]
-    edited[1][:, columns] = states[always][:, columns]
-    return AugmentedEpisodes(
-        copy_source=np.tile(view.episode_ids, 2),
-        edit_copy=np.concatenate([episodes, episodes + view.n_episodes]),
-        edit_step=np.tile(steps, 2),
-        edit_state=np.concatenate(edited),
     )
 
 

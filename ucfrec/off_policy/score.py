@@ -163,25 +163,16 @@ def _add_history(
 ) -> tuple[EpisodeStore, UserRows]:
     """The sessions and all rows of their users; earlier rows of a session that goes on are a part
     of it, as in `recommend`, but where sessions have ids, which the store does not keep."""
-    store = _select_observations(store, trained)
-    if earlier is not None:
-        earlier = _select_observations(earlier, trained)
+    for log in (store, earlier):
+        if log is not None and log.observation_size != trained.record.observation_size:
+            raise InputError(
+                f"the policy was trained with observations of {trained.record.observation_size} "
+                f"numbers; those of the logs have {log.observation_size}"
+            )
     rows = UserRows.of(store, users, earlier)
     if trained.record.session_by == schema.SESSION_ID:
         return store, rows
     return rows.continue_sessions(trained.record.session_gap_ms), rows
-
-
-def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
-    """`store` with the columns of the observations that the policy sees."""
-    if store.observation_size != trained.logged_observation_size:
-        raise InputError(
-            f"the policy was trained with observations of {trained.logged_observation_size} "
-            f"numbers; those of the logs have {store.observation_size}"
-        )
-    if not store.observation_size or not trained.record.dropped_observations:
-        return store
-    return store.without_observation_dimensions(trained.record.dropped_observations)
 
 
 def score_steps(

@@ -64,9 +64,7 @@ _checked: Final = check_arguments(
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
-        **dict.fromkeys(
-            ("reward", "session_by", "dataset", "screen", "liked"), require_kind("text", str)
-        ),
+        **dict.fromkeys(("reward", "session_by", "dataset", "liked"), require_kind("text", str)),
         **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
         **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
@@ -166,7 +164,6 @@ class Recommender:
         split: Sequence[float | str | date] | None = None,
         mapping: Columns | None = None,
         dataset: str | None = None,
-        screen: str | None = None,
         refit: bool = False,
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
@@ -188,7 +185,6 @@ class Recommender:
             mapping: logs only: names of the columns, and feature tables; a dictionary of names is
                 enough. Or a TOML file, as for `ucfrec prepare --mapping`.
             dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
-            screen: "drop" or "copies", as for `ucfrec train --screen`.
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
                 `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
@@ -206,7 +202,7 @@ class Recommender:
             if out is not None and store.path.parent == folder:
                 store = keep_beside(run, store)
             watchers = Callbacks(on_step, on_validation)
-            record = train_policy(store, run, self.config, screen, refit, watchers)
+            record = train_policy(store, run, self.config, refit, watchers)
             if warning := record.learned_nothing(read_metrics(run / "policy")):
                 with use_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)

@@ -14,14 +14,13 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import REFIT, STORE_SUFFIX, RunRecord
 from ucfrec.runs.refit import refit_within
-from ucfrec.runs.screened import train_screened
+from ucfrec.runs.run import train_run
 
 
 def train_policy(
     store: EpisodeStore,
     out: Path,
     config: Config,
-    screen: str | None,
     refit: bool,
     callbacks: Callbacks = SILENT,
 ) -> RunRecord:
@@ -29,14 +28,13 @@ def train_policy(
 
     Args:
         out: run folder; an interrupted run resumes.
-        screen: as of `train_screened`.
         refit: whether it goes on learning from all rows once everything is chosen, which several
             processes do not; without it, the weights of the training rows are kept.
 
     Raises:
-        InputError: as `train_screened`.
+        InputError: as `train_run`.
     """
-    record = train_screened(store, out, config, screen, callbacks=callbacks)
+    record = train_run(store, out, config, callbacks=callbacks)
     if not refit:
         shutil.rmtree(out / REFIT, ignore_errors=True)
     elif processes() == 1:

@@ -94,7 +94,7 @@ def export(
         InputError: the extra `export` is not installed, the policy cannot be exported, the graph's
             scores differ from torch's, or `out` exists.
     """
-    _require_installed()
+    require_installed()
     graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
     model = graph.scorer.reward_model
     if graph.scorer.rule.reward_weight and model is not None and model.running.any():
@@ -109,8 +109,8 @@ def export(
     with atomic_folder(out) as scratch:
         path, difference = scratch / GRAPH, 0.0
         sizes = {"inputs": tuple(shapes)}
-        _write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
-        runner = _start_runner(path)
+        write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
+        runner = start_runner(path)
         for sessions in (_COMPARED, 1):
             example = _draw_inputs(graph.scorer, sessions, seed=sessions)
             difference = max(difference, _measure_difference(graph, runner, example, _SERVE))
@@ -200,13 +200,13 @@ def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Te
         InputError: the extra `export` is not installed, the policy scores items in a way of its own
             or cannot be exported, or what the graph gives differs from torch's.
     """
-    _require_installed()
+    require_installed()
     network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
     example = _draw_inputs(scorer, 1, seed=0, mask=True)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / GRAPH
-        _write_graph(network, example, path, ["scores"], kind, _TORCH)
-        runner = _start_runner(path)
+        write_graph(network, example, path, ["scores"], kind, _TORCH)
+        runner = start_runner(path)
     for number in range(1, 1 + _COMPARED):
         example = _draw_inputs(scorer, 1, seed=number, mask=True)
         _measure_difference(network, runner, example, _TORCH)
@@ -250,7 +250,7 @@ def _draw_inputs(
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
-def _start_runner(path: Path) -> Any:
+def start_runner(path: Path) -> Any:
     """An `onnxruntime.InferenceSession` with one thread."""
     import onnxruntime
 
@@ -316,13 +316,14 @@ def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: floa
     return largest
 
 
-def _require_installed() -> None:
+def require_installed() -> None:
+    """Check that the packages of the extra `export` are there; InputError without one."""
     for name in ("onnx", "onnxruntime", "onnxscript"):
         if find_spec(name) is None:
             raise InputError(f"ONNX needs {name}, which is not installed; install ucfrec[export]")
 
 
-def _write_graph(
+def write_graph(
     module: nn.Module,
     inputs: dict[str, Tensor],
     path: Path,
@@ -382,7 +383,7 @@ def _describe_graph(
     outputs: dict[str, Tensor],
 ) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    rule, record, dropped = scorer.rule, trained.record, trained.record.dropped_observations
+    rule, record = scorer.rule, trained.record
 
     def describe(tensors: dict[str, Tensor]) -> list[dict[str, Any]]:
         return [
@@ -411,7 +412,6 @@ def _describe_graph(
         "reward": record.reward,
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
-        **({"dropped_observations": [*dropped]} if dropped else {}),
         "fingerprint": record.fingerprint,
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),

@@ -299,7 +299,7 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
     Raises:
         InputError: the policy needs observations that the histories lack.
     """
-    expected, observations = trained.logged_observation_size, None
+    expected, observations = trained.record.observation_size, None
     if expected:
         logged = histories.observations
         size = 0 if logged is None else logged.shape[1]
@@ -308,8 +308,8 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
                 f"the policy was trained with observations of {expected} numbers; those of the "
                 f"histories have {size}"
             )
-        seen = torch.from_numpy(np.delete(logged, trained.record.dropped_observations, axis=1))
-        observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
+        context = trained.policy.config.context
+        observations = torch.tensor(logged).unsqueeze(1).expand(-1, context, -1)
     users = trained.users.numbers(histories.users)
     rows, rewards = histories.item_ids, histories.rewards
     return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)

@@ -142,7 +142,7 @@ class Responder:
         self._reader = HistoryReader(
             trained.record.data.duplicates,
             trained.record.session_by == SESSION_ID,
-            trained.logged_observation_size,
+            trained.record.observation_size,
             RowRewards(reward_of(trained)),
         )
         self._unknown = {"unknown_items": Mean(0, 0), "unknown_users": Mean(0, 0)}

@@ -21,7 +21,6 @@ from pydantic import (
 from ucfrec.acting.decision import SavedRule
 from ucfrec.choosing.choice import Evidence, RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
-from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -89,20 +88,10 @@ class TrainingRecord(Record):
     """Of packages."""
     wall_time_s: Number
     """Of all stages, resumptions included."""
-
-
-class Screening(Entry):
-    """The report of `ucfrec.counterfactual.screening`, and what was done about it."""
-
-    how: Literal["drop", "copies"]
-    dimensions: tuple[DimensionReport, ...]
-    reward_r2: float | None = None
-    transitions: Count = 0
-
-    @property
-    def flagged(self) -> list[int]:
-        """The observation columns without effect."""
-        return [dimension.dimension for dimension in self.dimensions if not dimension.causes]
+    dropped_observations: tuple[Count, ...] = ()
+    """Columns of the logged observation that the policy does not see, ascending."""
+    extra: dict[Text, Any] = Field(default_factory=dict)
+    """Entries of the program that trained it, which `ucfrec` keeps and does not read."""
 
 
 class Candidate(Entry):
@@ -194,9 +183,6 @@ class RunRecord(TrainingRecord):
     """Mean negative log-likelihood (nats) of the logged items over all validation steps: `uniform`
     if all are equally probable, `popularity` if their probability is their share of the training
     steps, with one added to every count. None if actions are vectors."""
-    dropped_observations: tuple[Count, ...] = ()
-    """Columns of the logged observation that the policy does not see, ascending."""
-    screening: Screening | None = None
     refit_of: dict[str, Any] | None = None
     """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
     update: Update | None = None
@@ -292,9 +278,6 @@ class RunRecord(TrainingRecord):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
             lines += _describe_rule(self.rule, self.reward_model, self.mean_return)
-        if self.screening is not None:
-            flagged = ", ".join(map(str, self.screening.flagged)) or "none"
-            lines.append(f"screening     observation columns without effect: {flagged}")
         return "\n".join(lines)
 
 

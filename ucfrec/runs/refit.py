@@ -11,7 +11,6 @@ from ucfrec.fitting import distributed
 from ucfrec.provenance import config_hash
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 from ucfrec.user_model.session_end import SESSIONS
@@ -42,14 +41,16 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         )
     if trained.record.policy is None:
         raise InputError(f"{first} is not finished; train it to its end first")
-    names = ("dropped_observations", "augmentation", "screening", "update")
+    names = ("dropped_observations", "augmentation", "extra", "update")
     entries: dict[str, Any] = {name: getattr(trained.record, name) for name in names}
     entries["refit_of"] = _identity(trained)
     if out == first / REFIT:
         entries |= place_of(store.path, first)
     chosen, has_reward_model = trained.record, trained.reward_model is not None
     del trained  # the memory of its items, which the training needs
-    store, config = drop_columns(store, chosen.dropped_observations), chosen.config
+    if chosen.dropped_observations:
+        store = store.without_observation_dimensions(chosen.dropped_observations)
+    config = chosen.config
     steps = max(1, round(SHARE * chosen.finished.best_step))
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)

@@ -18,7 +18,6 @@ from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, measure_drift
@@ -82,7 +81,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
-    opened = drop_columns(EpisodeStore.open(grown), trained.record.dropped_observations)
+    opened = EpisodeStore.open(grown)
     full = trained.record.config  # as a training from scratch had it
     if trained.record.update is not None:
         full = config_from_dict(trained.record.update.settings_from_nothing)
@@ -100,8 +99,7 @@ def update_run(
         appended={name: count for name, count in counts.items() if type(count) is int}
         | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
-    entries = {"update": update, "dropped_observations": trained.record.dropped_observations}
-    record = train_run(opened, out, config, entries, initial=run)
+    record = train_run(opened, out, config, {"update": update}, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
         # The drift of the new rows and the verdict.
@@ -118,5 +116,5 @@ def update_run(
         update = record.update.model_copy(update={"drift": changes, "verdict": verdict})
         record = record.copy_with(update=update).write(out)
     if options.refit:
-        refit_within(EpisodeStore.open(grown), out)
+        refit_within(opened, out)
     return record

@@ -8,7 +8,6 @@ from typing import Any, Final
 from ucfrec.benchmark.cells import Cell, Measurement, describe_updates, open_store, training_config
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.screened import SCREENING
 from ucfrec_control.benchmark.robustness import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.training.evaluate import evaluate_run
@@ -20,6 +19,7 @@ from ucfrec_control.training.rl_baselines import (
     rl_config,
     train_rl,
 )
+from ucfrec_control.training.screening import SCREENING, read_screening
 from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 TARGET: Final = "target"
@@ -65,7 +65,8 @@ def train(cell: Cell) -> RunRecord | RLRecord:
     if cell.policy in ALGORITHMS:
         assert cell.training_seed is not None
         return train_rl(store, cell.run, rl_config_of(cell), cell.training_seed)
-    return train_control(store, cell.run, cell.config, screening=cell.screening, shared=cell.shared)
+    screening = cell.options.get(SCREENING)
+    return train_control(store, cell.run, cell.config, screening=screening, shared=cell.shared)
 
 
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
@@ -87,8 +88,8 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     values = (0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0)
     evaluations = [evaluate(cell, checkpoints=("last",), distractor=v)[0] for v in values]
     more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **describe_updates(cell)}
-    if record.screening is not None:
-        more[SCREENING] = verdicts(record.screening.dimensions, store)
+    if (screening := read_screening(record)) is not None:
+        more[SCREENING] = verdicts(screening.dimensions, store)
     return [evaluations[0].of(row_key).extended(more)]
 
 

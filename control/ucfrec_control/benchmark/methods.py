@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from ucfrec.benchmark.cells import PAPER_UCF, Method, make_augmented_ucf
+from ucfrec_control.training.screening import SCREENING
 
 SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
@@ -135,8 +136,8 @@ LONGER = {
 TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}
 """Rows of each table, as in `METHODS`."""
 SCREENED = {
-    "ucf-screened": replace(METHODS["ucf"], screening="copies"),
-    "ucf-dropped": replace(METHODS["ucf"], screening="drop"),
+    "ucf-screened": replace(METHODS["ucf"], options={SCREENING: "copies"}),
+    "ucf-dropped": replace(METHODS["ucf"], options={SCREENING: "drop"}),
 }
 """UCF with augmentation that intervenes on flagged dimensions, and UCF trained without them."""
 ROBUST: Methods = {

@@ -8,12 +8,12 @@ policy with the distractor fixed to 1 instead isolates the effect of the distrac
 from collections.abc import Sequence
 from typing import Any
 
-from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 from ucfrec_control.data.distractor import CLEAN
+from ucfrec_control.training.screening import SCREENING, DimensionReport
 
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
@@ -89,7 +89,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     """
     lines: list[dict[str, Any]] = []
     for row in rows:
-        verdicts = row.details.get("screening")
+        verdicts = row.details.get(SCREENING)
         if verdicts is None:
             continue
         added = [d for d in verdicts if d["distractor"]]

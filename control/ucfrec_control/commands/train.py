@@ -1,6 +1,6 @@
 """`ucfrec-control train`: train a policy on a store; resumes."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 
@@ -10,6 +10,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.environments.environments import environment_of_data
+from ucfrec_control.training.screening import read_screening
 from ucfrec_control.training.selection import select_by_return
 from ucfrec_control.training.train import (
     control_policies,
@@ -25,6 +26,9 @@ class Train(TrainingOptions):
 
     policy: Annotated[str, "NAME", Names(control_policies, closed=True)] = "ucf"
     """Policy."""
+    screen: Literal["drop", "copies"] | None = None
+    """What to do with state dimensions without effect; train without them, or add copies of the
+    trajectories that intervene on them (default: not screened)"""
     select_by_return: Annotated[int | None, POSITIVE, "EPISODES"] = None
     """Also keep the weights with the highest return in so many episodes at every validation, as
     checkpoint return (paper, Appendix G.3)"""
@@ -42,5 +46,8 @@ class Train(TrainingOptions):
             callbacks = select_by_return(self.out, env_id, self.select_by_return)
         record = train_control(store, self.out, config, screening=self.screen, callbacks=callbacks)
         print(record.describe())
+        if (screening := read_screening(record)) is not None:
+            flagged = ", ".join(map(str, screening.flagged)) or "none"
+            print(f"screening     observation columns without effect: {flagged}")
         print(describe_returns(store))
         print(f"\nrun: {self.out}; TensorBoard can open it")

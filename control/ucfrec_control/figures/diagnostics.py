@@ -23,7 +23,6 @@ from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.record import RunRecord, read_augmentation
 from ucfrec.runs.record import store_of as trained_store
-from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -48,7 +47,7 @@ def store_of(run: Path) -> EpisodeStore:
             f"{run} was trained on {record.store}, which is gone or has changed; move the run "
             "together with its store, or train again"
         )
-    return drop_columns(store, record.dropped_observations)
+    return store.without_observation_dimensions(record.dropped_observations)
 
 
 def is_augmented(run: Path) -> bool:

@@ -27,6 +27,7 @@ from ucfrec_control.environments.environments import (
 )
 from ucfrec_control.environments.scores import find_kind, find_task, normalise
 from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, read_run
+from ucfrec_control.training.screening import TREATMENT, read_screening
 from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
@@ -34,7 +35,6 @@ CHECKPOINTS = ("last", "best")
 RETURN = "return"
 """Checkpoint of `ucfrec_control.training.selection`."""
 NO_TARGET = "no target return"
-_SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
 EVALUATE = "evaluate"
 """Suite of the rows."""
 
@@ -151,9 +151,10 @@ def open_environment(
 
 def method_of(record: RunRecord | RLRecord) -> str:
     """Name of the method of a run, with a suffix for how screening treated what it flagged."""
-    if record.screening is None or not record.screening.flagged:
+    screening = read_screening(record)
+    if screening is None or not screening.flagged:
         return record.name
-    return record.name + _SUFFIXES[record.screening.how]
+    return record.name + {"copies": "-screened", "drop": "-dropped"}[record.extra[TREATMENT]]
 
 
 def takes_target(record: RunRecord | RLRecord) -> bool:

@@ -1,7 +1,5 @@
 """A policy of action vectors as an ONNX graph of one window of history."""
 
-import logging
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +12,14 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
+from ucfrec.recommending.export import (
+    DESCRIPTION,
+    GRAPH,
+    require_close,
+    require_installed,
+    start_runner,
+    write_graph,
+)
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.training.evaluate import load_run, rules_of
 
@@ -26,9 +32,6 @@ _MEANINGS: Final = {
     "target_return": "return that the rest of the episode shall have: the target less the rewards "
     "so far, or where `target_per_step` is true, the target itself",
 }
-GRAPH: Final = "model.onnx"
-DESCRIPTION: Final = "model.json"
-_TOLERANCE: Final = 1e-5
 _REMEDY: Final = "use ucfrec_control.ControlPolicy"
 _COMPARED: Final = 64
 """Random windows on which the graph is compared with torch."""
@@ -81,24 +84,22 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
     if not isinstance(trained, TrainedPolicy):
         raise InputError(f"{run} is of IQL or CQL; export it with d3rlpy, or {_REMEDY}")
     (rule, *_) = rules_of(trained, None)
+    require_installed()
     graph = WindowGraph(trained, rule).eval()
     arguments, batch = _draw_windows(graph, trained, 3), torch.export.Dim("batch", min=1, max=2**20)
+    shapes = {name: {0: batch} for name in arguments}
     with atomic_folder(out) as scratch:
-        runner, difference = _write_graph(graph, arguments, scratch / GRAPH, batch), 0.0
+        write_graph(graph, arguments, scratch / GRAPH, ["action"], trained.name, _REMEDY, shapes)
+        runner, difference = start_runner(scratch / GRAPH), 0.0
         input_names = {entry.name for entry in runner.get_inputs()}
         for count in (_COMPARED, 1):
             arguments = _draw_windows(graph, trained, count)
             with torch.no_grad():
-                expected = graph(**arguments).numpy()
+                expected = graph(**arguments)
             fed = {name: value.numpy() for name, value in arguments.items() if name in input_names}
-            (action,) = runner.run(None, fed)
-            size = max(float(np.abs(expected).max()), 1e-6)
-            difference = max(difference, float(np.abs(action - expected).max()) / size)
-        if not difference <= _TOLERANCE:
-            raise InputError(
-                f"onnxruntime's actions differ from torch's by {difference:.2g}, more than "
-                f"{_TOLERANCE:g}; {_REMEDY}, and report this"
-            )
+            size = max(float(expected.abs().max()), 1e-6)
+            pairs = zip(runner.run(None, fed), [expected], strict=True)
+            difference = max(difference, require_close(pairs, _REMEDY, size))
         description: dict[str, Any] = {
             "inputs": {
                 name: {"shape": ["batch", *value.shape[1:]], "meaning": _MEANINGS[name]}
@@ -114,36 +115,6 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
         }
         write_json(scratch / DESCRIPTION, description)
     return difference
-
-
-def _write_graph(graph: WindowGraph, arguments: dict[str, Tensor], path: Path, batch: Any) -> Any:
-    """Write a graph whose first dimension may vary; returns an `onnxruntime.InferenceSession`."""
-    level = logging.root.manager.disable
-    try:
-        import onnxruntime
-
-        logging.disable(logging.ERROR)
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            torch.onnx.export(
-                graph,
-                tuple(arguments.values()),
-                path,
-                input_names=[*arguments],
-                output_names=["action"],
-                dynamic_shapes={name: {0: batch} for name in arguments},
-                opset_version=20,
-                dynamo=True,
-                external_data=False,
-                verbose=False,
-            )
-    except ImportError as error:
-        raise InputError(
-            f"ONNX needs {error.name}, which is not installed; install ucfrec[export]"
-        ) from None
-    finally:
-        logging.disable(level)
-    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
 def _draw_windows(graph: WindowGraph, trained: TrainedPolicy, count: int) -> dict[str, Tensor]:

@@ -18,7 +18,6 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
-from ucfrec.runs.screened import drop_columns
 from ucfrec_control.training.evaluate import Trained
 from ucfrec_control.training.rl_baselines import RLPolicy
 
@@ -95,7 +94,7 @@ def estimate(
             f"{store.path}: observations and actions have sizes {stored}, the policy was trained "
             f"on {expected}; name a store of the same robot"
         )
-    store = drop_columns(store, dropped)
+    store = store.without_observation_dimensions(dropped)
     if store.lengths.max() < 2:
         raise InputError(f"{store.path}: no trajectory has two steps; log longer ones")
     logged, chosen = store.column(schema.ACTION), choose_actions(trained, rule, store)

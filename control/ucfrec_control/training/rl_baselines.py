@@ -86,9 +86,7 @@ class RLRecord(TrainingRecord):
     config: RLRun
     policy: RLFit | None = None
     threads: int
-    dropped_observations: tuple[int, ...] = ()
     augmentation: None = None
-    screening: None = None
 
     @property
     def name(self) -> str:

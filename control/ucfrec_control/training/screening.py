@@ -9,8 +9,18 @@ Indicators of a category follow from one another, and help together alone: so al
 flagged but measurements of the reward is tested once more, together and without these.
 
 Where the reward cannot be predicted well without what measures it, no help is no evidence. There a
-dimension is flagged only if it is such a measurement (`ucfrec.counterfactual.screening`) and does
-not help to predict the next state.
+dimension is flagged only if it is such a measurement and does not help to predict the next state.
+
+A dimension d_t that measures the reward (r_t, or r_{t+1}) predicts it as a cause would, but what
+the rest explains of it, the action above all, it explains through the reward. So
+
+1. the rest (other dimensions, action, next action) helps to predict d_t;
+2. the reward alone predicts d_t at least as well;
+3. given the reward, the rest hardly helps any more.
+
+A cause fails one of these. If the logging policy did not see it, the action explains none of it
+(1); if the policy did, the action explains it with or without the reward (3). A dimension of a
+process that goes on, such as a position, is explained by other dimensions (3).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -20,25 +30,30 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor, nn
 
-from ucfrec.counterfactual.screening import (
-    CLIP,
-    MAX_TRANSITIONS,
-    DimensionReport,
-    ScreeningReport,
-    compute_p_value,
-    find_measurements,
-    held_out_steps,
-    standardise,
-    steps_with_successor,
-)
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
 from ucfrec.processes import progress, random_state_kept
+from ucfrec.runs.record import TrainingRecord
 from ucfrec.runs.start import training_views
+from ucfrec.user_model.reward_report import draw_numbers
 
+SCREENING, TREATMENT = "screening", "treatment"
+"""Extra entries of a run's record: the report, and what was done about it, "drop" or "copies"."""
 _CHUNK = 1024
 _HELPED = 3
+_CLIP = 10.0
+"""Standardised values beyond this many standard deviations are clipped."""
+_MIN_EXPLAINED, _LEVEL = 0.003, 0.001
+"""Least share of a dimension's variance that the rest and the reward must each explain, and the
+level of the test that they do."""
+_MOST_ADDED = 0.25
+"""Largest share of what the rest explains that it may add to the reward."""
+_HELD_OUT_EVERY = 5
+_ANSWERS = {True: "yes", False: "no", None: "–"}
 
 
 @dataclass(frozen=True)
@@ -56,8 +71,11 @@ class ScreeningConfig:
     """Transitions of an update."""
     learning_rate: float = 3e-3
     """Highest step size of the updates; a third of it for the copies."""
-    max_transitions: int = MAX_TRANSITIONS
-    """Largest number of transitions used."""
+    max_transitions: int = 100_000
+    """Largest number of transitions used; of more, that many are drawn."""
+    trees: int = 150
+    """Largest number of boosted trees that predict a dimension from the reward or the rest; fewer
+    grow where rows kept apart are predicted no better."""
     min_effect: float = 0.01
     """Least share of a next dimension's unexplained variance that counts as help."""
     capped: float = 0.005
@@ -69,6 +87,68 @@ class ScreeningConfig:
     """Level of the tests, over held-out episodes."""
     min_reward_r2: float = 0.9
     """Least R² of the reward at which no help is evidence."""
+
+
+@dataclass(frozen=True)
+class DimensionReport:
+    """Whether one dimension has an effect, and what it adds to the others and the action."""
+
+    dimension: int
+    effect: float | None = None
+    """Share it explains of what the others leave unexplained of the next dimensions it helps most
+    (partial R², their mean), the reward given; None where it is not tested."""
+    helps: tuple[int, ...] = ()
+    """Those dimensions, most helped first, chosen on fitted episodes."""
+    p_value: float | None = None
+    """Of no help there, one-sided, over held-out episodes."""
+    reward_effect: float | None = None
+    """Share it explains of the reward's variance."""
+    reward_p_value: float | None = None
+    measures_reward: bool | None = None
+    """Whether it records the reward after the fact; None where that does not matter."""
+    causes: bool = True
+    """Whether it counts as having an effect, be it for want of evidence, or with others that are no
+    help one by one."""
+
+
+@dataclass(frozen=True)
+class ScreeningReport:
+    """The verdict on every dimension."""
+
+    dimensions: tuple[DimensionReport, ...]
+    reward_r2: float
+    """Held-out R² of the reward with all dimensions known."""
+    transitions: int
+
+    @property
+    def flagged(self) -> tuple[int, ...]:
+        """Dimensions without effect."""
+        return tuple(d.dimension for d in self.dimensions if not d.causes)
+
+    def describe(self) -> str:
+        """The verdicts as a table."""
+        lines = [f"{self.transitions:,} transitions, reward R² {self.reward_r2:.4f}", ""]
+        lines.append("dimension  next state        p     reward        p  measures reward  causes")
+        for d in self.dimensions:
+            numbers = (
+                (d.effect, ".4f", 10),
+                (d.p_value, ".1g", 7),
+                (d.reward_effect, ".5f", 9),
+                (d.reward_p_value, ".1g", 7),
+            )
+            line = f"{d.dimension:>9}"
+            for value, form, width in numbers:
+                line += f"  {'–' if value is None else format(value, form):>{width}}"
+            measures, causes = _ANSWERS[d.measures_reward], "yes" if d.causes else "NOTHING"
+            lines.append(f"{line}  {measures:>15}  {causes}")
+        flagged = ", ".join(map(str, self.flagged)) or "none"
+        return "\n".join([*lines, "", f"dimensions without effect: {flagged}"])
+
+
+def read_screening(record: TrainingRecord) -> ScreeningReport | None:
+    """What the screening before a training found; None if there was none."""
+    report = record.extra.get(SCREENING)
+    return None if report is None else TypeAdapter(ScreeningReport).validate_python(report)
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
@@ -90,8 +170,8 @@ def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Sc
 
     def measured(dimensions: Sequence[int]) -> list[int]:
         """Those of `dimensions` that measure the reward."""
-        new = [dimension for dimension in dimensions if dimension not in measures]
-        measures.update(find_measurements(train, config.max_transitions, seed, new))
+        if new := [dimension for dimension in dimensions if dimension not in measures]:
+            measures.update(_find_measurements(data, new))
         return [dimension for dimension in dimensions if measures[dimension]]
 
     tested: Sequence[int] = range(data.size)
@@ -141,18 +221,31 @@ class _Data:
     the state until the next step."""
 
     def __init__(self, view: EpisodeStore, config: ScreeningConfig, seed: int) -> None:
-        self.episodes, steps = steps_with_successor(view, config.max_transitions, seed)
-        transitions = view.transitions(self.episodes, steps)
+        episodes, steps = view.all_steps()
+        inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
+        inner = inner[draw_numbers(len(inner), config.max_transitions, seed)]
+        self.episodes, steps = episodes[inner], steps[inner]
+        now = view.transitions(self.episodes, steps)
+        then = view.transitions(self.episodes, steps + 1)
         mean, std = view.state_statistics
         scale = torch.where(std > 1e-6, std, 1.0)
-        states = (transitions.states - mean) / scale
-        self.states, self.size = states.clamp(-CLIP, CLIP), states.shape[1]
-        self.actions = standardise(transitions.actions)
-        self.rewards = standardise(transitions.rewards.unsqueeze(1))
-        self.changes = standardise((transitions.next_states - mean) / scale - states)
+        states = (now.states - mean) / scale
+        self.states, self.size = states.clamp(-_CLIP, _CLIP), states.shape[1]
+        self.actions = _standardise(now.actions)
+        self.rewards = _standardise(now.rewards.unsqueeze(1))
+        self.changes = _standardise((now.next_states - mean) / scale - states)
         self.moving = self.changes.abs().amax(0) > 0
-        held_out = held_out_steps(view, self.episodes)
+        # What measurements of the reward are told by.
+        self.columns = _standardise(now.states).numpy()
+        self.both_actions = _standardise(torch.cat([now.actions, then.actions], dim=1)).numpy()
+        self.both_rewards = _standardise(torch.stack([now.rewards, then.rewards], dim=1)).numpy()
+        held_out = self.episodes % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2
         self.seen, self.held_out = np.flatnonzero(~held_out), np.flatnonzero(held_out)
+        if len(np.unique(self.episodes[self.held_out])) < 3:
+            raise InputError(
+                f"{view.path} has {view.n_episodes} training episodes, too few of them with two "
+                f"steps or more; screening needs at least {3 * _HELD_OUT_EVERY}"
+            )
         variance = self.rewards[torch.from_numpy(self.held_out)].var()
         self.reward_variance = max(float(variance), 1e-12)
         self.config, self.seed = config, seed
@@ -163,6 +256,76 @@ class _Data:
         for row, dimensions in enumerate(missing):
             absences[row, 0, list(dimensions)] = 1.0
         return absences
+
+
+def _find_measurements(data: _Data, tested: Sequence[int]) -> dict[int, bool]:
+    """Whether dimensions measure the reward, by their errors on held-out episodes."""
+    leaks, untested = set[int](), [d for d in range(data.size) if d not in tested]
+    with progress(data.size, "screening, what measures the reward", "dimensions") as bar:
+        for dimension in (*tested, *untested):
+            if (dimension in tested or leaks) and _measures(data, dimension, ()):
+                leaks.add(dimension)
+            bar.update()
+    # A measurement explains a cause too, through the reward: the others are excluded from the rest.
+    return {d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d})) for d in tested}
+
+
+def _measures(data: _Data, dimension: int, without: Collection[int]) -> bool:
+    """Whether a dimension measures the reward; the columns `without` are excluded from the rest."""
+    from sklearn.ensemble import HistGradientBoostingRegressor  # takes a second to import
+
+    values, seen, held_out = data.columns[:, dimension], data.seen, data.held_out
+    alone = np.square(values[held_out] - values[seen].mean(dtype=np.float64))
+    variance = max(float(alone.mean()), 1e-12)
+
+    def explain(columns: Float32Array) -> Float64Array:
+        """Share (B,) of the variance that columns explain of held-out steps."""
+        model = HistGradientBoostingRegressor(
+            max_iter=data.config.trees,
+            max_leaf_nodes=15,
+            early_stopping=True,
+            n_iter_no_change=8,
+            random_state=data.seed,
+        )
+        model.fit(columns[seen], values[seen])
+        errors = np.square(values[held_out] - model.predict(columns[held_out]))
+        return np.asarray((alone - errors) / variance)
+
+    def is_explained(shares: Float64Array) -> bool:
+        p_value = _compute_p_value(torch.from_numpy(shares), data.episodes[held_out])
+        return bool(shares.mean() >= _MIN_EXPLAINED) and p_value < _LEVEL
+
+    # The cheapest first: most dimensions fail one of these.
+    by_reward = explain(data.both_rewards)
+    if not is_explained(by_reward):
+        return False
+    dimensions = np.delete(data.columns, [dimension, *without], axis=1)
+    inputs = np.column_stack([dimensions, data.both_actions])
+    by_rest = explain(inputs)
+    if not is_explained(by_rest) or by_reward.mean() < by_rest.mean():
+        return False
+    by_both = explain(np.column_stack([inputs, data.both_rewards]))
+    return bool(by_both.mean() - by_reward.mean() <= _MOST_ADDED * by_rest.mean())
+
+
+def _standardise(values: Tensor) -> Tensor:
+    """Columns with mean 0 and standard deviation 1, clipped; constant ones are 0."""
+    std, mean = torch.std_mean(values, dim=0)
+    return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-_CLIP, _CLIP)
+
+
+def _compute_p_value(differences: Tensor, episodes: IntArray) -> float:
+    """Of a mean of at most 0, one-sided, of differences (B,) of steps whose whole episodes (B,) are
+    independent."""
+    from scipy import stats  # takes long to import
+
+    _, cluster = np.unique(episodes, return_inverse=True)
+    counts = np.bincount(cluster)
+    values = differences.double().numpy()
+    residual = np.bincount(cluster, values) - counts * values.mean()
+    # Cluster-robust standard error of the mean.
+    error = np.sqrt((residual**2).sum() * len(counts) / (len(counts) - 1)) / len(values)
+    return float(stats.t.sf(values.mean() / max(error, 1e-300), len(counts) - 1))
 
 
 class _Perceptrons(nn.Module):
@@ -285,10 +448,10 @@ class _Errors(NamedTuple):
             pair = self.next_state[[without, having]][:, :, helped]
             capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
             saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)
-            effect, p_value = float(saved.mean()), compute_p_value(saved.mean(1), episodes)
+            effect, p_value = float(saved.mean()), _compute_p_value(saved.mean(1), episodes)
         more = self.reward[without] - self.reward[having]
         of_reward = float(more.mean()) / data.reward_variance
-        reward_p_value = compute_p_value(more, episodes)
+        reward_p_value = _compute_p_value(more, episodes)
         report = DimensionReport(
             dimension, effect, tuple(helped.tolist()), p_value, of_reward, reward_p_value
         )

@@ -5,7 +5,7 @@ from typing import Final
 from ucfrec.benchmark.suite import Benchmark, Shown
 from ucfrec.benchmark.tables import distractor_table, method_table, sweep_table
 from ucfrec_simulators.benchmark.measure import MEASUREMENT
-from ucfrec_simulators.benchmark.methods import BUDGETS, COMPONENTS, METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, COMPONENTS, METHODS
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import TASKS
 
@@ -20,7 +20,7 @@ BENCHMARK: Final = Benchmark(
     },
     budgets=BUDGETS,
     tasks=TASKS,
-    methods={**METHODS, **COMPONENTS, **SCREENED},
+    methods={**METHODS, **COMPONENTS},
     plan=RecommendationCells,
     how=MEASUREMENT,
 )

@@ -9,7 +9,7 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import claim
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.screened import SCREENING, train_screened
+from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorEnvironment
 
@@ -33,12 +33,8 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         ]
     # Cells that differ only in their evaluation share a run.
     with claim(cell.run, wait=True):
-        record = train_screened(
-            open_store(cell), cell.run, cell.config, cell.screening, shared=cell.shared
-        )
+        record = train_run(open_store(cell), cell.run, cell.config, shared=cell.shared)
     training_metrics, rows = _training_metrics(record), []
-    if record.screening is not None:
-        training_metrics[SCREENING] = list(record.screening.flagged)
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
     rule, quantile = trained.rule, cell.evaluation.target_quantile
     if quantile is not None and cell.conditioned:  # the plan's target

@@ -84,12 +84,6 @@ COMPONENTS: Final[Mapping[str, Method]] = {
 }
 """UCF without one of the shared components, or with another one, by their name in the table
 `shared`. `ucf-wo-policy` has policy weight 0 wherever it looks ahead."""
-SCREENED: Final[Mapping[str, Method]] = {
-    "ucf-screened": replace(METHODS["ucf"], screening="copies", vectors=False),
-    "ucf-dropped": replace(METHODS["ucf"], screening="drop", vectors=False),
-}
-"""UCF with augmentation that intervenes on the observation columns that screening flags, and UCF
-without these columns, by their name in the distractor table."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog", "sardine-boredinf")
 SHARED_TASKS: Final = ("kuairand", "synthetic-catalog", "sardine-boredinf")
 """Tasks of the table of shared components, whose actions are items."""

@@ -18,7 +18,6 @@ from ucfrec_simulators.benchmark.methods import (
     DISTRACTED,
     METHODS,
     PAPER,
-    SCREENED,
     SHARED_TASKS,
     SWEPT,
 )
@@ -33,8 +32,7 @@ GATES: Final = (0.02, 1e6)
 """ε_r in standard deviations of the rewards; the last value disables the gate. The first λ is the
 default, and the line to compare with."""
 DISTRACTOR_METHODS: Final[Mapping[str, Method]] = {
-    **{name: METHODS[name] for name in ("bc", "dt", *PAPER, "ucf")},
-    **SCREENED,
+    name: METHODS[name] for name in ("bc", "dt", *PAPER, "ucf")
 }
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""

@@ -13,6 +13,7 @@ from tests.support.result_rows import result_row
 from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Evaluation, open_store
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.files.atomic import read_json
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
@@ -25,7 +26,7 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.training.evaluate import evaluate_run
-from ucfrec_control.training.screening import ScreeningConfig, screen_states
+from ucfrec_control.training.screening import ScreeningConfig, read_screening, screen_states
 from ucfrec_control.training.train import train_control
 
 
@@ -70,7 +71,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert math.isnan(found["early", 1]["drop"])
 
 
-QUICK = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50)
+QUICK = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50, trees=5)
 
 
 def write_screenable(path: Path) -> Path:
@@ -90,14 +91,12 @@ def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(plan, "DISTRACTORS", kinds)
     write_screenable(tmp_path / f"{MADE}.hdf5")
     # Begun here, where screening may be made quick, and gone on with by the command.
-    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
     runs, stages = {}, tmp_path / "stages"
     for cell in plan.robustness_cells(tmp_path, out, budget):
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
-        if cell.screening is not None:
-            own = {"screening": cell.screening, "shared": stages}
-            train_control(open_store(cell), cell.run, cell.config, **own)
+        if cell.options:
+            train_control(open_store(cell), cell.run, cell.config, **cell.options, shared=stages)
     command = ("robustness", "--data", tmp_path, "--out", out, "--results", results)
     printed = control(*command)[0]
     rows, before = read_rows(results), results.read_text()
@@ -133,19 +132,22 @@ def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_screening_is_recorded_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Predictors this small reach no larger share of the reward.
     config = replace(QUICK, hidden=8, min_reward_r2=0.5)
-    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: config)
     store, run = tmp_path / "store", tmp_path / "run"
     control("prepare", write_screenable(tmp_path / "hopper.hdf5"), "--out", store)
     command = ("train", store, "--out", run, "--policy", "bc", "--screen", "copies")
     command += tuple(set_options(("train.steps=2", "policy.dim=8")))
     printed = control(*command)[0]
-    screening = RunRecord.read(run).screening
+    screening = read_screening(RunRecord.read(run))
     assert 4 in screening.flagged
     said = ", ".join(map(str, screening.flagged))
     assert f"columns without effect: {said}\n" in printed
     control(*command)
-    assert RunRecord.read(run).screening == screening
+    assert read_screening(RunRecord.read(run)) == screening
+    report = tmp_path / "report.json"
+    assert screening.describe() in control("screen", store, "--json", report)[0]
+    recorded = read_json(run / "run.json")["extra"]["screening"]
+    assert read_json(report).items() >= recorded.items()
 
 
 @pytest.mark.slow

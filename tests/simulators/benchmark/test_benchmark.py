@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
-from ucfrec.benchmark.cells import Budget, Evaluation, describe_updates, make_key, training_config
+from ucfrec.benchmark.cells import Budget, Evaluation, describe_updates, make_key
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
@@ -24,11 +24,11 @@ from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
 from ucfrec.results.rows import ResultRow, append_rows, read_rows
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.record import RUN, read_record
+from ucfrec.runs.record import RUN
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
 from ucfrec_simulators.benchmark.measure import measure
-from ucfrec_simulators.benchmark.methods import BUDGETS, METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, METHODS
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import Log, kuairand
 from ucfrec_simulators.kuai.environment import EXITS
@@ -178,24 +178,14 @@ def test_a_task_that_is_named_is_measured_alone(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
-def test_screened_methods_have_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
+def test_the_distractor_is_off_and_on(tmp_path: Path) -> None:
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
-    wanted = ("bc", *SCREENED)
     cells = [cell for cell in given.cells("distractor") if cell.task.endswith("distractor")]
-    found = {cell.method: cell for cell in cells if cell.method in wanted}
-    assert found.keys() == set(wanted)
-    assert len({(cell.run, str(training_config(cell))) for cell in found.values()}) == 3
-    rows = {name: measure(cell, make_key(cell)) for name, cell in found.items()}
-    for name, own in rows.items():
-        assert {row.conditions["distractor"] for row in own} == {0.0, 1.0}
-        assert {"screening" in row.details for row in own} == {name in SCREENED}
-        assert {row.target_return is None for row in own} == {name == "bc"}
-    run = found["ucf-dropped"].run
-    flagged = tuple(read_record(run).screening.flagged)
-    assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {flagged}
-    assert TrainedPolicy.load(run).record.dropped_observations == flagged
+    (cell, *_) = (cell for cell in cells if cell.method == "bc")
+    rows = measure(cell, make_key(cell))
+    assert {row.conditions["distractor"] for row in rows} == {0.0, 1.0}
+    assert {row.target_return for row in rows} == {None}
 
 
 def test_show_only_measures_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

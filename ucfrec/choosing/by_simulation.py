@@ -77,7 +77,8 @@ class Outcomes(NamedTuple):
 
 class _ManyRules(PolicyActor):
     """Acts by the rule of each session: n sessions by each of several scorers of one policy, each
-    with a generator of its own, so that it draws what it would draw alone."""
+    with a generator of its own, so that it draws what it would draw alone. A decision is a list,
+    whose items are the actions of so many steps; a session goes on to the end of its list."""
 
     def __init__(
         self,
@@ -85,6 +86,7 @@ class _ManyRules(PolicyActor):
         n: int,
         store: EpisodeStore,
         seed: int,
+        length: int,
     ) -> None:
         states, rows = store.item_states, len(scorers) * n
         users = np.arange(len(states.user_features))
@@ -93,6 +95,8 @@ class _ManyRules(PolicyActor):
         self._targets = [(each.rule.target, each.rule.minimum_target) for each in scorers]
         self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
         self._rule = np.repeat(np.arange(len(scorers)), n)
+        self._lists, self._chances = torch.zeros(2, 0, 0)
+        self._place, self._length = 0, length
 
     def keep(self, rows: IntArray) -> None:
         super().keep(rows)
@@ -104,6 +108,19 @@ class _ManyRules(PolicyActor):
         sessions: Sessions,
         excluded: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
+        place, self._place = self._place, (self._place + 1) % self._length
+        if not place:
+            lists = self._choose_lists(rows, sessions, excluded)
+            self._lists, self._chances = (torch.cat(parts) for parts in zip(*lists, strict=True))
+        return self._lists[:, place], self._chances[:, place]
+
+    def _choose_lists(
+        self,
+        rows: Tensor,
+        sessions: Sessions,
+        excluded: Tensor | None,
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Items and their probabilities, (M', length) each, of the `rows` part by part."""
         decisions = []
         most = max(1, _SCORES_AT_ONCE // self._n_items)
         for batch in _batch_rules(self._rule[rows.numpy()], most):
@@ -121,9 +138,20 @@ class _ManyRules(PolicyActor):
                 of_rule = query.at(slice(part.start - begin, part.stop - begin))
                 left_out = None if excluded is None else excluded[part]
                 scores = scorer.scores_of(of_rule, excluded=left_out)
-                decisions.append(scorer.rule.choose(scores, self._generators[number]))
-        items, chances = zip(*decisions, strict=True)
-        return torch.cat(items), torch.cat(chances)
+                decisions.append(self._choose(scorer.rule, scores, self._generators[number]))
+        return decisions
+
+    def _choose(
+        self,
+        rule: DecisionRule,
+        scores: Tensor,
+        generator: torch.Generator,
+    ) -> tuple[Tensor, Tensor]:
+        if self._length == 1:
+            items, chances = rule.choose(scores, generator)
+            return items.unsqueeze(1), chances.unsqueeze(1)
+        draws = torch.rand(len(scores), self._n_items + 1, generator=generator)
+        return rule.rank_items(scores, min(self._length, self._n_items), draws)
 
 
 def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:
@@ -152,6 +180,7 @@ class RuleSearch:
         new = self.users.reward_report.new_users
         self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
+        self._list = train.usual_list()
         counts = train.item_counts()
         if problem.validation.has_offers:
             # What is new in the validation sessions is not in the training ones.
@@ -224,8 +253,8 @@ class RuleSearch:
         """Simulate `n` sessions of each rule that begin as a store's, with draws of its own."""
         scorers = [self.problem.scorer.under(rule) for rule in rules]
         users = users or self.users
-        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules))
-        actor = _ManyRules(scorers, n, store, seed)
+        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules), self._list)
+        actor = _ManyRules(scorers, n, store, seed, self._list)
         live = np.arange(len(rules) * n)
         returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
         decisions = list[IntArray]()

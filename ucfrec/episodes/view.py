@@ -419,6 +419,13 @@ class EpisodeView:
         # A split may cut a decision whose rows have several times.
         return np.maximum(steps - self.step_values(schema.PLACE, episodes, steps), 0)
 
+    def usual_list(self) -> int:
+        """Mean number of rows of a decision, in whole rows; 1 or more."""
+        if schema.PLACE not in self.record.columns:
+            return 1
+        decisions = sum(int((places == 0).sum()) for (places,) in self.column_batches(schema.PLACE))
+        return max(1, round(self.n_steps / max(decisions, 1)))
+
     def decision_ends(self, episodes: IntArray, steps: IntArray) -> IntArray:
         """The steps (M,) after the decisions that steps (M,) of episodes (M,) belong to."""
         ends = steps + 1

@@ -73,6 +73,9 @@ class LoggedEnds:
         numbers = draw_numbers(int(ends[-1]), most, seed)
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - usable)[episodes]
+        # A list is shown whole: sessions end with the last row of a decision.
+        last = store.decision_ends(episodes, steps) == steps + 1
+        episodes, steps = episodes[last], steps[last]
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
         history = Shown.before(store, episodes, steps, lags)

@@ -24,6 +24,7 @@ from ucfrec.results.rows import (
     read_results,
     read_rows,
     row_from_json,
+    select_intervals,
 )
 
 WHOLE = result_row(
@@ -254,9 +255,35 @@ def test_a_notebook_shows_rows_and_warnings_and_no_markup_of_names() -> None:
 def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
     table = ResultTable(ROWS, ())
     axes = table.plot()
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["popular", "<b>"]
-    assert axes.lines[0].get_xdata().tolist() == [1.0, 1.5]  # type: ignore[union-attr]
+    texts = [text.get_text() for text in axes.texts]
+    assert [text.replace("\N{NO-BREAK SPACE}", " ") for text in texts] == [
+        "<b>: 1.5 [1, 2.5]",
+        "popular: 1",
+    ]
     assert table.plot("S", ax=axes) is axes
     for name in ("T", "method", "k"):
         with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
             table.plot(name)
+
+
+def test_the_picture_of_estimates_has_the_logged_return_and_each_rule_by_its_name() -> None:
+    def rows(target: float, value: float, reliable: bool) -> list[ResultRow]:
+        details = {"verdict": "v", "verdict_of": "DR", "decision_rule": {"target": target, "t": 1}}
+        row = replace(_BARE, metric="R_cum", details=details | {"reliable": reliable})
+        logged = replace(row, method="logged", policy="behavior", metrics={"R_cum": 2.0})
+        low, high = value - 1, value + 1
+        doubly = replace(row, method="DR", metrics={"R_cum": value}, interval=(low, high))
+        return [logged, replace(row, method="DM", metrics={"R_cum": 99.0}), doubly]
+
+    both = rows(5.0, 3.0, True) + rows(6.0, 4.0, False)
+    intervals, level = select_intervals(both)
+    assert level == ("logged", 2.0)
+    assert list(map(str, intervals)) == [
+        "dt, target 5: 3 [2, 4]",
+        "dt, target 6: the data cannot say",
+    ]
+    # Returns of several logs are no common level.
+    others = [replace(row, metrics={"R_cum": row.value + 1}) for row in rows(7.0, 1.0, True)]
+    assert select_intervals(both + others)[1] is None
+    texts = [text.get_text() for text in ResultTable(both, ()).plot().texts]
+    assert texts[-1].strip() == "logged: 2"

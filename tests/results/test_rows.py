@@ -266,24 +266,16 @@ def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
             table.plot(name)
 
 
-def test_the_picture_of_estimates_has_the_logged_return_and_each_rule_by_its_name() -> None:
-    def rows(target: float, value: float, reliable: bool) -> list[ResultRow]:
-        details = {"verdict": "v", "verdict_of": "DR", "decision_rule": {"target": target, "t": 1}}
-        row = replace(_BARE, metric="R_cum", details=details | {"reliable": reliable})
-        logged = replace(row, method="logged", policy="behavior", metrics={"R_cum": 2.0})
-        low, high = value - 1, value + 1
-        doubly = replace(row, method="DR", metrics={"R_cum": value}, interval=(low, high))
-        return [logged, replace(row, method="DM", metrics={"R_cum": 99.0}), doubly]
-
-    both = rows(5.0, 3.0, True) + rows(6.0, 4.0, False)
-    intervals, level = select_intervals(both)
-    assert level == ("logged", 2.0)
-    assert list(map(str, intervals)) == [
-        "dt, target 5: 3 [2, 4]",
-        "dt, target 6: the data cannot say",
+def test_a_chart_of_estimates_has_those_of_verdicts_and_the_logged_return() -> None:
+    details = {"verdict": "v", "verdict_of": "DR", "reliable": True}
+    named = {"logged": ("behavior", 2.0), "DM": ("dt", 99.0), "DR": ("dt", 3.0)}
+    estimates = [
+        replace(_BARE, method=name, policy=policy, metric="R_cum", metrics={"R_cum": value})
+        for name, (policy, value) in named.items()
     ]
+    estimates = [replace(row, details=details) for row in estimates]
+    axes = ResultTable(estimates, ()).plot()
+    assert [text.get_text().strip() for text in axes.texts] == ["dt: 3", "logged: 2"]
     # Returns of several logs are no common level.
-    others = [replace(row, metrics={"R_cum": row.value + 1}) for row in rows(7.0, 1.0, True)]
-    assert select_intervals(both + others)[1] is None
-    texts = [text.get_text() for text in ResultTable(both, ()).plot().texts]
-    assert texts[-1].strip() == "logged: 2"
+    fewer = [replace(row, metrics={"R_cum": row.value + 1}) for row in estimates]
+    assert select_intervals(estimates + fewer)[1] is None

@@ -77,9 +77,7 @@ def test_the_page_works_without_scripts(explorer: Explorer) -> None:
     rule = {"custom": "on", "reward_weight": "0", "temperature": "0"}
     assert "only here" in got(explorer, "/", user="7", k="3", keep_seen="on", **rule).text
     assert "script-src 'self'" in answer.headers["content-security-policy"]
-    report = got(explorer, "/report/0").text
-    assert report.startswith("<!DOCTYPE html>")
-    assert "Model card" in report
+    assert "Model card" in got(explorer, "/report/0").text
     assert got(explorer, "/report/7").status_code == 404
 
 

@@ -64,8 +64,8 @@ def test_the_numbers_are_those_of_the_record(runs: Path, tmp_path: Path) -> None
         "copies": report["copies"],
         "acceptance": report["acceptance"],
         "bound": report["delta"] + report["epsilon_r"],
-        "reward model: z share": model["z_share"],
-        "moves: mean move ratio": moves["mean_move_ratio"],
+        "reward_model.z_share": model["z_share"],
+        "moves.mean_move_ratio": moves["mean_move_ratio"],
     }
     for name, value in expected.items():
         assert number(copies[name]["ucf"]) == pytest.approx(value, rel=1e-3), name

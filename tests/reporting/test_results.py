@@ -54,6 +54,11 @@ def test_the_picture_has_the_logged_return_and_no_number_that_does_not_stand(
     assert second.answer == "Do not rely on this"  # of several, without the reasons
     _, alone = findings_of(tmp_path, files[1])
     assert (alone.subject, alone.answer) == ("ucf", "Do not rely on this: 7 users")
+    doubted = {"value": 0.7, "low": None, "high": None, "reasons": ["few users"]}
+    sure = doubted | {"low": 0, "high": 1, "reasons": []}
+    groups = [{"name": "young", "difference": doubted}, {"name": "old", "difference": sure}]
+    _, grouped = findings_of(tmp_path, call(4.0, True, groups=groups))
+    assert grouped.parts[0].rows == [("young", ["–; few users"]), ("old", ["0.7 [0, 1]"])]
     chosen, *_ = findings_of(tmp_path, call(4.0, True, selection="first is best"))
     assert chosen.answer == "first is best"
     (_, unknown) = findings_of(tmp_path, [estimate("DR", 2.0)])

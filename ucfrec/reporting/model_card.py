@@ -67,11 +67,7 @@ def write_card(run: Path) -> Path:
 
 
 def add_measurement(
-    run: Path,
-    how: str,
-    of: str,
-    values: Mapping[str, object],
-    remarks: Sequence[str] = (),
+    run: Path, how: str, of: str, values: Mapping[str, object], remarks: Sequence[str] = ()
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 

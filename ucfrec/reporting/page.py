@@ -19,7 +19,7 @@ from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.logs.summary import format_report
 from ucfrec.reporting.items import Features, features_by_id, read_features
 from ucfrec.reporting.model_card import describe_data, describe_user_model
-from ucfrec.reporting.results import NO_RESULTS, conclude_update, read_findings
+from ucfrec.reporting.results import conclude_update, read_findings
 from ucfrec.reporting.tables import Table
 from ucfrec.reporting.training import (
     POINTS,
@@ -100,7 +100,6 @@ def render_report(
         version=__version__,
         findings=findings,
         answers=grouped((f for f in findings if f.answer), lambda finding: finding.answer),
-        no_results=NO_RESULTS,
         warnings=warnings,
         sections=sections,
         points=POINTS,

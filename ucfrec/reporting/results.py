@@ -6,7 +6,7 @@ than a test of the difference at 5%.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +30,6 @@ _OF_STEP = (_STEP, "effective_steps", "largest_weight")
 """Columns of the tables of estimates."""
 _WORDS = {"R_cum": "Return per episode"}
 """Names of metrics in conclusions."""
-NO_RESULTS = (
-    "No results are given, so the returns of these policies are unknown: a validation loss "
-    "measures how well logged choices are predicted, not the return. Evaluate the policies in a "
-    "simulator (ucfrec evaluate --json) or from logs (ucfrec ope --json), and give the rows with "
-    "--results."
-)
 
 
 @dataclass(frozen=True)
@@ -50,6 +44,8 @@ class Finding:
     remarks: Sequence[str] = ()
     """What to know of the numbers."""
     chart: Chart | None = None
+    parts: list[Table] = field(default_factory=list)
+    """Guardrails and groups, which a page shows unfolded."""
 
 
 def read_findings(paths: Sequence[Path]) -> list[Finding]:
@@ -61,12 +57,11 @@ def read_findings(paths: Sequence[Path]) -> list[Finding]:
     """
     findings, rows = list[Finding](), list[ResultRow]()
     for path in paths:
-        values = read_json(path) if path.suffix == ".json" else None
-        if not values or not isinstance(values, dict):
+        if path.suffix == ".json" and isinstance(values := read_json(path), dict) and values:
+            with damage_explained(path, "write it again"):
+                findings.append(_read_object(path.name, values))
+        else:
             rows += read_results(path)
-            continue
-        with damage_explained(path, "write it again"):
-            findings.append(_read_object(path.name, values))
     kinds = grouped(rows, lambda row: row.suite == SUITE and row.metric in ("R_cum", _STEP))
     measured = kinds.get(False, ())
     tables = grouped(measured, lambda row: (row.table, row.environment or row.task, row.metric))
@@ -102,8 +97,29 @@ def _conclude_estimates(rows: Sequence[ResultRow]) -> list[Finding]:
         if len(calls) > 1 and row.details.get("reliable") is not True:
             # The reasons are among the warnings.
             answer = answer.partition(":")[0]
-        findings.append(Finding(name, answer, tables, row.details.get("warnings", ())))
+        parts = [
+            _tabulate_parts(f"{key.capitalize()} of {name}", row.details[key])
+            for key in ("guardrails", "groups")
+            if row.details.get(key)
+        ]
+        warnings = row.details.get("warnings", ())
+        findings.append(Finding(name, answer, tables, warnings, parts=parts))
     return findings
+
+
+def _tabulate_parts(caption: str, parts: Sequence[Mapping[str, Any]]) -> Table:
+    """Guardrails or groups, each with a name, evidence and other values; where a reason speaks
+    against the evidence, the reason takes the place of its number."""
+    body = []
+    for part in parts:
+        name, *cells = part.values()
+        for place, cell in enumerate(cells):
+            if isinstance(cell, Mapping) and (cell["reasons"] or cell["low"] is None):
+                cells[place] = "; ".join(["–", *cell["reasons"][:1]])
+            elif isinstance(cell, Mapping):
+                cells[place] = Interval(name, cell["value"], cell["low"], cell["high"]).numbers
+        body.append((str(name), cells))
+    return Table(caption, list(parts[0])[1:], body)
 
 
 def answer_of(row: ResultRow) -> str:
@@ -144,8 +160,8 @@ def _conclude_comparison(test: Comparison) -> Finding:
     first, second = test.arms
     title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
     chart = interval_chart(title, intervals, ("no difference", 0.0))
-    subject = f"The A/B test of {first} and {second}"
-    return Finding(subject, test.conclusion, (), str(test).splitlines(), chart)
+    remarks = str(test).splitlines()
+    return Finding(f"The A/B test of {first} and {second}", test.conclusion, (), remarks, chart)
 
 
 def conclude_update(of: str, verdict: UpdateVerdict) -> Finding:

@@ -25,7 +25,7 @@ class Table:
     """Head of the column of row names."""
 
     @classmethod
-    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[str, object]]) -> "Table":
+    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[Any, object]]) -> "Table":
         """A table of columns by name, with a row for every name in at least one of them."""
         names = dict.fromkeys(name for column in columns.values() for name in column)
         rows = [(name, [column.get(name) for column in columns.values()]) for name in names]

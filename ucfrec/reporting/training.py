@@ -76,13 +76,11 @@ def _thin_curve(curve: Mapping[int, float]) -> dict[float, float]:
 
 def tabulate_augmentation(reports: Mapping[str, AugmentationReport]) -> Table:
     """Quality of the reward model and of the edits, one column per run by name."""
-    columns = {}
-    for name, report in reports.items():
-        numbers = pd.json_normalize(asdict(report)).select_dtypes("number").loc[0]
-        heads = [str(name).replace("_", " ").replace(".", ": ") for name in numbers.index]
-        columns[name] = dict(zip(heads, numbers, strict=True))
-    caption = "Reward model and augmented episodes, on held-out steps, in units of the reward"
-    return Table.of_columns(caption, columns)
+    columns = {
+        name: pd.json_normalize(asdict(report)).select_dtypes("number").loc[0].to_dict()
+        for name, report in reports.items()
+    }
+    return Table.of_columns("Reward model and augmented episodes, on held-out steps", columns)
 
 
 def tabulate_samples(run: Path, items: Features) -> tuple[str, list[Table]] | None:

@@ -60,6 +60,7 @@ _STYLE: Final[Any] = {
 _LINE, _BAR, _BOTTOM = 16, 28, 26
 """Heights of a line of a label, of the bar below it with a gap, and of the axis below all."""
 _LABEL_CHARACTERS = 48
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
@@ -163,11 +164,8 @@ def draw_intervals(
     from matplotlib import rcParams
 
     # Numbers have spaces that do not break.
-    numbers = [interval.numbers.replace(" ", "\N{NO-BREAK SPACE}") for interval in intervals]
-    labels = [
-        textwrap.fill(f"{one_line(interval.name)}: {text}", _LABEL_CHARACTERS)
-        for interval, text in zip(intervals, numbers, strict=True)
-    ]
+    texts = [f"{one_line(i.name)}: {i.numbers.replace(' ', _NO_BREAK)}" for i in intervals]
+    labels = [textwrap.fill(text, _LABEL_CHARACTERS) for text in texts]
     slot = _LINE * max((label.count("\n") + 1 for label in labels), default=1) + _BAR
     top = _LINE / slot if level else 0.0
     axes.set(ylim=(max(len(labels), 1), -top), yticks=[])

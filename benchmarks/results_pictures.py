@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ucfrec.reporting.charts import OURS, PAGE, PLAIN, file_style, save
+from ucfrec.results.charts import OURS, PAGE, PLAIN, file_style, save
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-from ucfrec.reporting.charts import SERIES, SOFT, page_style, render  # noqa: E402
+from ucfrec.results.charts import SERIES, SOFT, page_style, render  # noqa: E402
 
 DOCS = ROOT / "docs"
 ASSETS = DOCS / "assets"

@@ -50,9 +50,9 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(
         assert ("with the shared components" in said) == (SHARED in methods)
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
-        assert f"R_cum in {environment}" in page
+        assert f"{environment}: R_cum with" in page
         for name in TINY.names(environment):
-            assert f"<summary>{environment}/{name}</summary>" in page
+            assert f"<summary>{environment}/{name}: run.json</summary>" in page
     weights = tmp_path / "demo" / ENVIRONMENTS[0] / "dt" / "policy" / "best.safetensors"
     written_at = weights.stat().st_mtime_ns
     monkeypatch.setattr("ucfrec.commands.demo.FULL", TINY)

@@ -27,9 +27,11 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Recommender:
     return Recommender("dt", settings=settings).fit(random_log(), folder / "run", **given)
 
 
-def explained(policy: Recommender, rule: DecisionRule, seen: bool = False) -> Explained:
+def explained(
+    policy: Recommender, rule: DecisionRule, seen: bool = False, **more: Any
+) -> Explained:
     (user,) = read_histories(policy.trained, None, None, [7])
-    return explain(policy.trained, rule, user, 5, seen)
+    return explain(policy.trained, rule, user, 5, seen, **more)
 
 
 RULES = [DecisionRule(2.0, reward_weight=2.0), DecisionRule(2.0, policy_weight=0.5)]
@@ -53,16 +55,50 @@ def test_the_parts_order_items_as_recommend_does(policy: Recommender, rule: Deci
 
 def test_excluded_items_have_their_reason(policy: Recommender) -> None:
     by_seen = explained(policy, DecisionRule(2.0), seen=True).excluded
-    assert {each.reason for each in by_seen} == {"the user has seen it"}
-    assert [each.rank for each in by_seen] == sorted(each.rank for each in by_seen)
+    assert {reason for *_, reason in by_seen} == {"the user has seen it"}
+    ranks = [rank for _, rank, _ in by_seen]
+    assert ranks == sorted(ranks)
     tagged = explained(policy, DecisionRule(2.0, tag_window=2))
-    last = [item for item, _ in tagged.rows[:2]]
+    last = [item for item, *_ in tagged.rows[:2]]
     assert tagged.excluded
-    for each in tagged.excluded:
-        assert each.reason == "it shares a tag with one of the last 2 items"
-        assert each.item_id % 5 in {item % 5 for item in last}
-    assert not {card.item_id for card in tagged.cards} & {e.item_id for e in tagged.excluded}
+    for item_id, _, reason in tagged.excluded:
+        assert reason == "it shares a tag with one of the last 2 items"
+        assert item_id % 5 in {item % 5 for item in last}
+    left_out = {item_id for item_id, *_ in tagged.excluded}
+    assert not {card.item_id for card in tagged.cards} & left_out
     assert not explained(policy, DecisionRule(2.0)).excluded
+    some = explained(policy, DecisionRule(2.0, tag_window=2), candidates=["1", "6", "7"])
+    assert {card.item_id for card in some.cards} | {item for item, *_ in some.excluded} == {1, 6, 7}
+    assert all(rank <= 3 for _, rank, _ in some.excluded)
+
+
+def test_a_moment_hides_what_was_shown_later(policy: Recommender) -> None:
+    now = explained(policy, DecisionRule(2.0), seen=True)
+    _, _, time = now.rows[0]
+    moment = round(1000 * time.timestamp())
+    earlier = explained(policy, DecisionRule(2.0), seen=True, time_ms=moment)
+    assert earlier.rows == [row for row in now.rows if row[2] < time]
+    # Only what was shown by then is excluded as seen.
+    assert {item for item, *_ in earlier.excluded} <= {item for item, *_ in earlier.rows}
+    # As with a log that ends there.
+    log = random_log()
+    log = log[(log.user_id == 7) & (log.timestamp < moment)]
+    frame = policy.recommend(log, k=5, rule=DecisionRule(2.0))
+    assert [card.item_id for card in earlier.cards] == frame.item_id.tolist()
+    assert not earlier.new_session
+    much_later = explained(policy, DecisionRule(2.0), time_ms=moment + 10**9)
+    assert (much_later.new_session, much_later.rows) == (True, now.rows)
+
+
+def test_items_that_won_by_chance_are_marked(policy: Recommender) -> None:
+    drawn = explained(policy, DecisionRule(2.0, temperature=50.0), seed=3)
+    again = explained(policy, DecisionRule(2.0, temperature=50.0), seed=4)
+    assert [card.item_id for card in drawn.cards] != [card.item_id for card in again.cards]
+    scores = [sum(card.parts.values()) for card in drawn.cards]
+    marks = [score < max(scores[place:]) for place, score in enumerate(scores)]
+    assert [card.by_chance for card in drawn.cards] == marks
+    assert any(marks)
+    assert not any(card.by_chance for card in explained(policy, DecisionRule(2.0)).cards)
 
 
 def test_a_read_pasted_is_recommended_for(policy: Recommender) -> None:
@@ -71,12 +107,11 @@ def test_a_read_pasted_is_recommended_for(policy: Recommender) -> None:
     assert frame.reward.tolist() == [1, 0, 0]
     (user,) = read_histories(policy.trained, frame, None, None)
     found = explain(policy.trained, DecisionRule(2.0), user, 4, True)
-    assert [str(item) for item, _ in found.rows] == ["7", "5", "3"]
+    assert [str(item) for item, *_ in found.rows] == ["7", "5", "3"]
     assert len(found.cards) == 4
     for text, message in (
         ("3, 1\n5, x", "line 2 of the history is '5, x'; write item_id"),
         ("3, nan", "line 1"),
-        ("1\n" * 1001, "1,001 rows; paste at most 1,000"),
     ):
         with pytest.raises(InputError, match=message):
             read_pasted(text)

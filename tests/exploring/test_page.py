@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -76,20 +77,45 @@ def test_the_page_works_without_scripts(explorer: Explorer) -> None:
     rule = {"custom": "on", "reward_weight": "0", "temperature": "0"}
     assert "only here" in got(explorer, "/", user="7", k="3", keep_seen="on", **rule).text
     assert "script-src 'self'" in answer.headers["content-security-policy"]
-    assert "Model card" in answer.text
-    assert got(explorer, "/report/0").text.startswith("<!DOCTYPE html>")
+    assert "Model card" in got(explorer, "/report/0").text
     assert got(explorer, "/report/7").status_code == 404
 
 
-def test_off_policy_values_are_shown_by_target(explorer: Explorer) -> None:
-    assert [target for target, _, _ in explorer.values] == [1.0, 6.0]
+def test_it_opens_with_an_example_user_and_the_history_first(explorer: Explorer) -> None:
     page = got(explorer, "/").text
-    assert "Off-policy value against the target return" in page
-    assert page.count("<tr><th") == 3
-    for _, _, row in explorer.values:
-        assert f"{row.value:.4g} [" in page
-    assert '<figure class="chart"><svg ' in page
-    assert "Off-policy value" not in Explorer(explorer.runs).page({})
+    example = str(explorer.examples[0])
+    assert f'name="user" list="users" value="{example}"' in page
+    assert page.index(f"What was shown to user {example} before") < page.index("recommends</h2>")
+    # The number in the field is that of the cards.
+    assert 'name="k" min="1" max="100" value="10"' in page
+    assert page.count('class="card"') == 20
+    assert "Choose a user" in got(explorer, "/", user="").text
+    assert "<noscript><button" in page
+
+
+def test_the_moment_and_the_candidates_are_those_of_the_form(explorer: Explorer) -> None:
+    page = got(explorer, "/", user="7", keep_seen="on", candidates="3\r\n 5 \r\n\r\n").text
+    assert set(re.findall('data-item="([^"]*)"', page)) == {"3", "5"}
+    assert page.count('class="card"') == 4
+    early = got(explorer, "/", user="7", time="1990-01-01T00:00").text
+    assert "0 rows; the latest 0, from the last. A new session begins" in early
+    assert early.count('class="card"') == 20
+
+
+def test_a_rule_that_draws_is_explained(explorer: Explorer) -> None:
+    custom = {"user": "7", "custom": "on", "reward_weight": "0"}
+    words = "This rule draws", "probability ", "by chance</span>"
+    for temperature, draws in (("2", True), ("0", False)):
+        text = got(explorer, "/results", temperature=temperature, **custom).text
+        assert [word in text for word in words] == [draws] * 3
+
+
+def test_what_results_say_is_on_the_page(explorer: Explorer) -> None:
+    page = got(explorer, "/").text
+    assert "Do not rely on this estimate" in page
+    assert page.count("<figure>") == 1
+    assert "Mean return of a session" in page
+    assert "<figure>" not in Explorer(explorer.runs).page({})
 
 
 def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
@@ -108,7 +134,12 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
         ({"user": "nobody"}, "has no user &#39;nobody&#39;; choose one of the list, or paste"),
         ({"user": "7", "k": "0"}, "k is &#39;0&#39;; give a number from 1 to 100"),
         ({"user": "7", "custom": "on", "temperature": "x"}, "temperature is"),
-        ({"user": "7", "custom": "on", "temperature": "-1"}, "temperature is -1"),
+        ({"user": "7", "custom": "on", "temperature": "-1"}, "give a number from 0 to 2"),
+        (
+            {"user": "7", "time": "noon"},
+            "time is &#39;noon&#39;; give one such as 2024-05-01T10:00",
+        ),
+        ({"user": "7", "candidates": "99"}, "1 of 1 named items are not known"),
         ({"history": "99, 1"}, "item_id that the policy does not know (1 item"),
         ({"history": "3, much"}, "line 1 of the history"),
     ],
@@ -123,7 +154,7 @@ def test_one_run_without_its_store_takes_a_pasted_history(explorer: Explorer) ->
     trained = explorer.runs[0]
     gone = trained.record.model_copy(update={"store": "gone", "store_from_run": None})
     alone = Explorer([replace(trained, record=gone)])
-    said = "the store of the run first, gone, is gone or has changed; paste a history"
+    said = "its store gone is gone or has changed; paste a history instead"
     assert said in alone.results({"user": "7"})
     listed = alone.results({"history": "3, 1"})
     assert 'class="card"' in listed
@@ -159,6 +190,25 @@ def test_a_visitor_moves_a_slider_and_pastes_a_history(address: str, tmp_path: P
         assert "line 2" in browser.run("document.querySelector('[role=alert]').textContent")
         fill(browser, "history", "3, 1\n4, 0")
         browser.until("document.querySelectorAll('.card').length === 12")
+        fill(browser, "candidates", "5\n6")
+        browser.until("document.querySelectorAll('.card').length === 4")
+        fill(browser, "k", "1")
+        browser.until("document.querySelectorAll('.card').length === 2")
+        fill(browser, "candidates", "")
+        fill(browser, "time", "1990-01-01T00:00")
+        browser.until("document.getElementById('results').textContent.includes('0 rows')")
+        user = browser.run("document.querySelector('.example').dataset.user")
+        browser.run("document.querySelector('.example').click()")
+        browser.until(f"document.querySelector('h2').textContent.includes('user {user} before')")
+        assert browser.run("form.elements.time.value + form.elements.history.value") == ""
+        assert browser.run("document.querySelector('button')") is None
+        fill(browser, "reward_weight", "0")
+        fill(browser, "temperature", "2")
+        fill(browser, "k", "6")
+        browser.until("document.querySelectorAll('.note ~ .cards .card').length === 12")
+        before = browser.run(first)
+        fill(browser, "seed", "1")
+        browser.until(f"JSON.stringify({first}) !== JSON.stringify({json.dumps(before)})")
         browser.view(375, 800, dark=True)
         assert browser.run("document.documentElement.scrollWidth") <= 375
         assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
@@ -174,9 +224,10 @@ def test_every_control_has_a_name_and_is_reached_by_keyboard(address: str, tmp_p
         )
         assert nameless == []
         reached = []
-        for _ in range(12):
+        for _ in range(30):
             for kind in ("keyDown", "keyUp"):
                 browser.send("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
                              windowsVirtualKeyCode=9)  # fmt: skip
             reached.append(browser.run("document.activeElement.id"))
-        assert {"user", "history", "k", "keep_seen", "custom", "reward_weight"} <= set(reached)
+        controls = {"user", "history", "time", "k", "candidates", "keep_seen", "custom", "seed"}
+        assert controls | {"reward_weight"} <= set(reached)

@@ -25,7 +25,7 @@ from ucfrec.files.parquet import (
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.reporting.training import read_features
+from ucfrec.reporting.items import read_features
 
 
 def test_a_pipe_is_refused_and_not_read(tmp_path: Path) -> None:

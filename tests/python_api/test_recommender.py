@@ -294,9 +294,10 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
     report.save(tmp_path / "ope.json")
     for given in (report, str(tmp_path / "ope.json")):
         assert clicked.report(tmp_path / "again.html", given).is_file()
-    for given in (ranking, [ranking]):
-        with pytest.raises(InputError, match="type Ranking; give what evaluate or ope returned"):
-            clicked.report(tmp_path / "no.html", given)
+    page = clicked.report(tmp_path / "ranked.html", ranking).read_text(encoding="utf-8")
+    assert f"has the highest {ranking.rows[0].metric}" in page
+    with pytest.raises(InputError, match="has 3; give what evaluate, ope or rank returned"):
+        clicked.report(tmp_path / "no.html", [3])  # type: ignore[list-item]
     with pytest.raises(InputError, match="is a folder, a file is needed"):
         clicked.report(tmp_path)
     card = (clicked.run / "MODEL_CARD.md").read_text(encoding="utf-8")

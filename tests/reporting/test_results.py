@@ -1,86 +1,148 @@
-"""The forest plot draws what each verdict is of, and whether it stands."""
+"""What the report says of results: the answer of each kind, one picture, and tables."""
 
+import json
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.support.report_page import estimate, row
+from ucfrec.errors import InputError
+from ucfrec.off_policy.ab_test import Comparison
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.reporting.results import NO_RESULTS, Estimates, conclude, draw_forest, find_quoted
-from ucfrec.results.rows import ResultRow
+from ucfrec.reporting.results import Finding, conclude_update, read_findings
+from ucfrec.results.rows import ResultRow, write_results
+from ucfrec.runs.record import Difference, UpdateVerdict
 
 
-def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
-    """The forest of policies a, b, … with the logged return and the rows of each."""
-    named = zip("ab", policies, strict=False)
-    estimates = [Estimates(name, [estimate(LOGGED, own), *rows]) for name, (own, rows) in named]
-    return draw_forest(estimates)
+def findings_of(folder: Path, *results: Any) -> list[Finding]:
+    """Findings of files, each of rows or of a JSON object."""
+    files = [folder / f"{number}.json" for number in range(len(results))]
+    for file, content in zip(files, results, strict=True):
+        if isinstance(content, dict):
+            file.write_text(json.dumps(content))
+        else:
+            write_results(file, content)
+    return read_findings(files)
 
 
-def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
-    doubly = estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True})
-    good = [estimate("IPS", 3.0), doubly]
-    bad = [estimate("DR", 9.0, details={"verdict_of": "DR", "reliable": False})]
-    first, second, _ = forest_of((2.0, good), (2.0, bad)).summary.split(". ")
-    assert first == "a: DR: 4, 95% interval 3.5 to 5.5, the estimate stands"
-    assert second == "b: DR: 9, 95% interval 8.5 to 10.5, do not rely on it"
+def call(value: float, reliable: bool, **more: Any) -> list[ResultRow]:
+    """The rows of `ucfrec ope` for one rule."""
+    says = "The policy has a higher return: +1" if reliable else "Do not rely on this: 7 users"
+    details = {"verdict": says, "verdict_of": "DR", "reliable": reliable, **more}
+    names = {LOGGED: 2.0, "DM": 99.0, "DR": value}
+    return [
+        estimate(name, x, "behavior" if name == LOGGED else "ucf", details=details)
+        for name, x in names.items()
+    ]
 
 
-def test_without_an_interval_there_is_no_line() -> None:
-    models = [estimate("DM", 1.0, interval=None), estimate("FQE", 2.0, interval=None)]
-    assert forest_of((2.0, models)) is None
-    assert forest_of() is None
-    snips = estimate("SNIPS", 1.0, details={"verdict_of": "SNIPS"})
-    assert find_quoted([*models, snips]) == snips
+def test_the_picture_has_the_logged_return_and_no_number_that_does_not_stand(
+    tmp_path: Path,
+) -> None:
+    rules = {"decision_rule": {"temperature": 1.0}}, {"decision_rule": {"temperature": 0.5}}
+    files = call(4.0, True, **rules[0]), call(9.0, False, **rules[1])
+    picture, first, second = findings_of(tmp_path, *files)
+    assert picture.chart is not None
+    assert picture.chart.summary == (
+        "ucf, temperature 1: 4 [3.5, 5.5]. ucf, temperature 0.5: the data cannot say. "
+        "For comparison, logged: 2"
+    )
+    assert [first.subject, second.subject] == ["ucf, temperature 1", "ucf, temperature 0.5"]
+    assert first.answer == "The policy has a higher return: +1"
+    assert second.answer == "Do not rely on this"  # of several, without the reasons
+    _, alone = findings_of(tmp_path, files[1])
+    assert (alone.subject, alone.answer) == ("ucf", "Do not rely on this: 7 users")
+    doubted = {"value": 0.7, "low": None, "high": None, "reasons": ["few users"]}
+    sure = doubted | {"low": 0, "high": 1, "reasons": []}
+    groups = [{"name": "young", "difference": doubted}, {"name": "old", "difference": sure}]
+    _, grouped = findings_of(tmp_path, call(4.0, True, groups=groups))
+    assert grouped.parts[0].rows == [("young", ["–; few users"]), ("old", ["0.7 [0, 1]"])]
+    chosen, *_ = findings_of(tmp_path, call(4.0, True, selection="first is best"))
+    assert chosen.answer == "first is best"
+    (_, unknown) = findings_of(tmp_path, [estimate("DR", 2.0)])
+    assert "no verdict" in unknown.answer
 
 
-def test_logs_that_differ_have_no_common_reference() -> None:
-    rows = [estimate("DR", 4.0, details={"verdict_of": "DR"})]
-    alike, different = forest_of((2.0, rows), (2.0, rows)), forest_of((2.0, rows), (3.0, rows))
-    assert alike.summary.endswith("For comparison, logged sessions: 2")
-    assert "logged sessions" not in different.summary
-    assert different.summary.count("do not rely on it") == 2
+def compared(folder: Path, *rows: ResultRow) -> str:
+    (finding,) = findings_of(folder, rows)
+    return finding.answer
 
 
 def earned(policy: str, value: float, **more: Any) -> ResultRow:
-    return row("a", policy, value, interval=(value - 0.1, value + 0.1), **more)
+    return row("a", policy, value, **{"interval": (value - 0.1, value + 0.1)} | more)
 
 
-def of_environment(*rows: ResultRow) -> str:
-    (said,) = conclude({"a": rows}, ())
-    return said
-
-
-def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
-    said = of_environment(
+def test_the_best_is_named_with_its_interval_and_what_it_lies_above(tmp_path: Path) -> None:
+    said = compared(
+        tmp_path,
         earned("random", 1.0), earned("optimal", 9.0), earned("logging", 2.95),
         earned("dt", 2.0, training_seed=0), earned("ucf", 3.0, training_seed=0),
     )  # fmt: skip
-    assert "ucf (3) has the highest return per episode of 2 trained (95%" in said
-    assert "(95% intervals 2.9 to 3.1; trainings: 1). Lower: dt (2), random (1)." in said
-    assert "Higher: optimal (9). Open, as intervals overlap: logging (2.95). It was tr" in said
-    said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
-    assert "Open, as intervals overlap: dt (2.9). No built-in policy" in said
-    said = of_environment(earned("random", 1.0))
-    assert said == "In a, only built-in policies were evaluated: random (1)."
-    assert conclude({}, ()) == [NO_RESULTS]
+    assert "ucf (3) has the highest return per episode of 2 trained: 95%" in said
+    assert "95% intervals 2.9 to 3.1; trainings: 1. Lower: dt (2), random (1)." in said
+    assert "Higher: optimal (9)." in said
+    assert "Open, as intervals overlap or are not known: logging (2.95). It was tr" in said
+    without = earned("dt", 1.0, training_seed=0, interval=None)
+    said = compared(tmp_path, without, earned("ucf", 3.0, training_seed=0))
+    assert "not known: dt (1). No built-in policy" in said
+    said = compared(tmp_path, earned("random", 1.0))
+    assert said == "Only built-in policies: random (1)."
 
 
-def test_seeds_of_training_are_taken_together() -> None:
+def test_seeds_of_training_are_taken_together(tmp_path: Path) -> None:
     rows = [earned("ucf", value, training_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
-    said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
-    assert "(95% intervals 2.9 to 5.1; trainings: 3). Open, as intervals overlap: random" in said
+    said = compared(tmp_path, *rows, earned("random", 3.5), earned("bad", 1.0))
+    assert "intervals 2.9 to 5.1; trainings: 3." in said
+    assert "not known: random (3.5)" in said
     assert "Lower: bad (1)." in said
     assert "trained once" not in said
     # Checkpoints of one run are no seeds.
     best, last = (earned("ucf", value, training_seed=0, checkpoint=name)
                   for name, value in (("best", 3.0), ("last", 2.0)))  # fmt: skip
-    said = of_environment(best, last)
+    said = compared(tmp_path, best, last)
     assert "ucf, checkpoint best (3) has the highest return" in said
     assert "trained once" in said
 
 
-def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
-    rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
-    (said,) = conclude({}, [Estimates("ucf", rows)])
-    assert said == "For ucf: higher."
-    (said,) = conclude({}, [Estimates("ucf", rows[:1])])
-    assert "no verdict" in said
+def test_rows_of_any_metric_have_a_picture_and_a_table_from_the_best(tmp_path: Path) -> None:
+    measured = {"ucf": 0.25, "popular": 0.5}
+    ranked = [row("a", n, x, metric="hit", metrics={"hit": x}) for n, x in measured.items()]
+    returns, hits = findings_of(tmp_path, [earned("ucf", 3.0)], ranked)
+    assert returns.chart is not None
+    assert returns.chart.summary == "ucf: 3 [2.9, 3.1]"
+    assert [name for name, _ in hits.tables[0].rows] == ["popular", "ucf"]
+
+
+def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> None:
+    counts: dict[str, Any] = {"without_user": 0, "without_arm": 0, "in_several": 3}
+    pairs = dict.fromkeys(("users", "in_arm", "rows", "without_value"), (500, 500))
+    test = Comparison(
+        column="clicks", arms=("old", "new"), values=(1.0, 1.5), shares=(0.5, 0.5),
+        difference=0.5, error=0.1, low=0.3, high=0.7, always_low=0.125, always_high=0.875,
+        **pairs, **counts,
+    )  # fmt: skip
+    difference = Difference(measure="reward", value=2.0, low=1.0, high=3.0)
+    doubtful = Difference(measure="ndcg", value=-9.0, low=-10.0, high=-8.0, doubt="few users")
+    verdict = UpdateVerdict(
+        result="better", decided_by="reward", differences=(difference, doubtful), steps=9, users=5
+    )
+    record = {"update": {"of": "run-1", "verdict": verdict.model_dump()}}
+    screened = {"dropped": 3, "columns": [1, 2], "verdict": "no effect"}
+    ab, update, others = findings_of(tmp_path, asdict(test), record, screened)
+    assert ab.answer == "new is better than old"
+    assert ab.chart is not None
+    assert "whenever looked at: 0.5 [0.125, 0.875]. For comparison, no difference: 0" in (
+        ab.chart.summary
+    )
+    assert any("3 users were in more than one arm" in text for text in ab.remarks)
+    assert update == conclude_update("run-1", verdict)
+    assert update.answer == "Better, by reward on the newest 9 rows of 5 users"
+    assert update.chart is not None
+    assert "reward: 2 [1, 3]. ndcg: the data cannot say" in update.chart.summary
+    assert (others.answer, others.tables[0].rows) == (
+        "", [("dropped", ["3"]), ("verdict", ["no effect"])]
+    )  # fmt: skip
+    with pytest.raises(InputError, match="is damaged"):
+        findings_of(tmp_path, {"always_low": 1})

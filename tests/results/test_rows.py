@@ -24,6 +24,7 @@ from ucfrec.results.rows import (
     read_results,
     read_rows,
     row_from_json,
+    select_intervals,
 )
 
 WHOLE = result_row(
@@ -254,9 +255,27 @@ def test_a_notebook_shows_rows_and_warnings_and_no_markup_of_names() -> None:
 def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
     table = ResultTable(ROWS, ())
     axes = table.plot()
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["popular", "<b>"]
-    assert axes.lines[0].get_xdata().tolist() == [1.0, 1.5]  # type: ignore[union-attr]
+    texts = [text.get_text() for text in axes.texts]
+    assert [text.replace("\N{NO-BREAK SPACE}", " ") for text in texts] == [
+        "<b>: 1.5 [1, 2.5]",
+        "popular: 1",
+    ]
     assert table.plot("S", ax=axes) is axes
     for name in ("T", "method", "k"):
         with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
             table.plot(name)
+
+
+def test_a_chart_of_estimates_has_those_of_verdicts_and_the_logged_return() -> None:
+    details = {"verdict": "v", "verdict_of": "DR", "reliable": True}
+    named = {"logged": ("behavior", 2.0), "DM": ("dt", 99.0), "DR": ("dt", 3.0)}
+    estimates = [
+        replace(_BARE, method=name, policy=policy, metric="R_cum", metrics={"R_cum": value})
+        for name, (policy, value) in named.items()
+    ]
+    estimates = [replace(row, details=details) for row in estimates]
+    axes = ResultTable(estimates, ()).plot()
+    assert [text.get_text().strip() for text in axes.texts] == ["dt: 3", "logged: 2"]
+    # Returns of several logs are no common level.
+    fewer = [replace(row, metrics={"R_cum": row.value + 1}) for row in estimates]
+    assert select_intervals(estimates + fewer)[1] is None

@@ -134,7 +134,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         """The ids in the file of candidates that the run knows; all ids if it knows none."""
         if self.candidates is None:
             return None
-        from ucfrec.reporting.training import read_features
+        from ucfrec.reporting.items import read_features
 
         table = read_features(self.candidates, [trained.record.data], text_ids=True)
         column = table.column(schema.ITEM_ID).drop_null()

@@ -17,8 +17,8 @@ class Report(Table):
     runs: Annotated[Sequence[Path], ARGUMENT, "RUN"] = ()
     """Run folders of `ucfrec train`."""
     results: Annotated[Sequence[Path], "FILE…"] = ()
-    """Results to show: JSON or JSON lines (.jsonl) of `ucfrec evaluate --json`, `ucfrec ope --json`
-    or `ucfrec demo` (default: none)"""
+    """Results to show: JSON that any command writes with --json, or result rows (.jsonl); those of
+    ope come first (default: none)"""
     items: Annotated[Path | None, "FILE"] = None
     """Item features to show with the sample recommendations: Parquet or CSV with a column item_id,
     or with the name that the log of the run has for it (default: none)"""

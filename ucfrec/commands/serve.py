@@ -166,11 +166,10 @@ class Explore(Table):
     """Run folder of `ucfrec train`; two are shown side by side."""
     items: Annotated[Path | None, "FILE"] = None
     """Item features to show: Parquet or CSV with a column item_id, or with the name that the log
-    of the run has for it; title (or name) and image_url (or image) are shown as such (default:
-    none)"""
+    of the run has for it; title (or name) and image_url (or image, picture, thumbnail) are shown
+    as such (default: none)"""
     results: Annotated[Sequence[Path], "FILE…"] = ()
-    """Results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict (default:
-    none)"""
+    """Results to show, as in `ucfrec report` (default: none)"""
     port: int = 8081
     """0 for a free one."""
 
@@ -183,7 +182,7 @@ class Explore(Table):
             print_ready,
             server_config,
         )
-        from ucfrec.reporting.training import read_features
+        from ucfrec.reporting.items import read_features
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs = [TrainedPolicy.load(run) for run in self.runs]

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
@@ -13,17 +14,17 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
-from ucfrec.recommending.recommend import recommend, sessions_of
+from ucfrec.recommending.recommend import SCORE, recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 PARTS: Final = ("policy", "exposure", "reward weight", "lookahead")
 _ALMOST_NONE = 1e-9
 """A lookahead that changes no score, but has rewards counted in the units of a lookahead."""
 _EXCLUDED = 10
-_MOST_ROWS = 1000
 
 
 @dataclass(frozen=True)
@@ -35,27 +36,23 @@ class Card:
     """Probability of the item at its position, given those before it."""
     parts: Mapping[str, float]
     """What each of `PARTS` adds to its score, relative to the mean of all items (nats)."""
-
-
-@dataclass(frozen=True)
-class Excluded:
-    """An item that is not recommended although its score is high."""
-
-    item_id: Any
-    rank: int
-    """Among all items by score, from 1."""
-    reason: str
+    by_chance: bool
+    """Whether an item below it has a higher score: it was drawn."""
 
 
 @dataclass(frozen=True)
 class Explained:
     """What one user is recommended, and why."""
 
-    rows: Sequence[tuple[Any, float]]
-    """Items that the user was shown, with their rewards, the latest first."""
+    rule: DecisionRule
+    rows: Sequence[tuple[Any, float, datetime]]
+    """Items that the user was shown, with their rewards and times (UTC), the latest first."""
+    new_session: bool
+    """Whether so much time has passed that a new session begins."""
     cards: Sequence[Card]
-    excluded: Sequence[Excluded]
-    """Those of the best items by score that are not recommended, best first."""
+    excluded: Sequence[tuple[Any, int, str]]
+    """Those of the best items by score that are not recommended, best first: the item, its rank
+    among all items, or all candidates, from 1, and the reason."""
 
 
 def explain(
@@ -64,36 +61,66 @@ def explain(
     user: Histories,
     k: int,
     filter_seen: bool,
+    *,
+    candidates: Sequence[Any] | None = None,
+    time_ms: int | None = None,
+    seed: int = 0,
 ) -> Explained:
     """The recommendations of `ucfrec recommend` for one user, with their reasons.
 
+    Args:
+        candidates: the only items to recommend; None for all.
+        time_ms: the moment of the decision, before which rows count; None for right after the last.
+        seed: of the draws of a rule that draws.
+
     Raises:
-        InputError: the rule does not fit the policy, or an item of the history is not known.
+        InputError: the rule does not fit the policy, or an item is not known.
     """
-    at = None if trained.offers is None else int(user.timestamps.max(initial=0))
-    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen, at=at)
+    gap, new = trained.record.session_gap_ms, False
+    at = time_ms
+    if time_ms is not None:
+        user = _cut_history(user, time_ms)
+        new = gap is not None and bool(time_ms - user.timestamps.max(initial=0) > gap)
+    elif trained.offers is not None:
+        at = int(user.timestamps.max(initial=0))
+    (frame,) = recommend(
+        trained,
+        [user],
+        k,
+        rule=rule,
+        filter_seen=filter_seen,
+        candidates=candidates,
+        new_session=new,
+        seed=seed,
+        at=at,
+    )
     # The user's latest session, before the step that is decided.
-    numbered = user.with_numbers(trained.items, False)
-    latest = numbered.latest_session(trained.record.session_gap_ms)
+    latest = user.with_numbers(trained.items, False).latest_session(gap, np.array([new]))
     sessions = sessions_of(trained, latest, trained.scorer().length)
     offer = None if trained.offers is None else trained.offers.at(torch.tensor([at]))
     parts = _score_parts(trained.scorer(rule), replace(sessions, offer=offer))
-    ids = frame[schema.ITEM_ID].to_numpy()
+    by_chance = frame[SCORE] < frame[SCORE][::-1].cummax()[::-1]
+    numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
+    columns = frame[schema.ITEM_ID], frame[schema.PROPENSITY], numbers, by_chance
     cards = [
-        Card(item_id, chance, {name: float(part[number]) for name, part in parts.items()})
-        for item_id, number, chance in zip(
-            ids.tolist(), trained.items.numbers(ids), frame[schema.PROPENSITY], strict=True
-        )
+        Card(item_id, chance, {name: float(part[number]) for name, part in parts.items()}, lucky)
+        for item_id, chance, number, lucky in zip(*columns, strict=True)
     ]
-    rows = list(
-        zip(
-            user.item_ids[::-1].tolist(),
-            user.rewards[::-1].tolist(),
-            strict=True,
-        )
-    )
-    excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
-    return Explained(rows, cards, excluded)
+    times = [datetime.fromtimestamp(time / 1000, UTC) for time in user.timestamps.tolist()]
+    rows = list(zip(user.item_ids.tolist(), user.rewards.tolist(), times, strict=True))[::-1]
+    allowed = None if candidates is None else trained.items.numbers(np.asarray(candidates))
+    scores = torch.stack([*parts.values()]).sum(0)
+    excluded = _find_excluded(trained, rule, user, sessions, filter_seen, scores, allowed)
+    return Explained(rule, rows, new, cards, excluded)
+
+
+def _cut_history(user: Histories, time_ms: int) -> Histories:
+    """What was known of one user before a moment."""
+    past = user.timestamps < time_ms
+    future = np.setdiff1d(user.item_ids[~past], user.item_ids[past])
+    seen = ~np.isin(user.seen_ids, future)
+    user = replace(user, seen_owner=user.seen_owner[seen], seen_ids=user.seen_ids[seen])
+    return user.with_rows(past)
 
 
 def read_pasted(text: str) -> pd.DataFrame:
@@ -101,23 +128,19 @@ def read_pasted(text: str) -> pd.DataFrame:
     last, as a frame of one user whose rows are a minute apart.
 
     Raises:
-        InputError: there are too many rows, or a reward is not a number.
+        InputError: a reward is not a number.
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    if len(lines) > _MOST_ROWS:
-        raise InputError(f"the history has {len(lines):,} rows; paste at most {_MOST_ROWS:,}")
-    items, rewards = [], []
-    for number, line in enumerate(lines, start=1):
-        item, comma, reward = line.rpartition(",")
-        items.append(item.strip() if comma else line)
-        try:
-            rewards.append(float(reward) if comma else 0.0)
-        except ValueError:
-            rewards.append(np.nan)
-        if not abs(rewards[-1]) <= schema.LARGEST_REWARD:
-            raise InputError(
-                f"line {number} of the history is {line[:60]!r}; write item_id, or item_id, reward"
-            )
+    parts = [line.rpartition(",") for line in lines]
+    items = [item.strip() if comma else line for item, comma, line in parts]
+    texts = pd.Series([reward if comma else "0" for _, comma, reward in parts])
+    rewards = pd.to_numeric(texts, errors="coerce")
+    faults = np.flatnonzero(~(rewards.abs() <= schema.LARGEST_REWARD))
+    if len(faults):
+        raise InputError(
+            f"line {faults[0] + 1} of the history is {lines[faults[0]][:60]!r}; write item_id, or "
+            "item_id, reward"
+        )
     times = int(time.time() * 1000) - 60_000 * np.arange(len(items), 0, -1)
     frame = pd.DataFrame({schema.USER_ID: "pasted", schema.ITEM_ID: items})
     return frame.assign(timestamp=times, session_id=0, reward=rewards)
@@ -157,8 +180,9 @@ def _find_excluded(
     sessions: Sessions,
     filter_seen: bool,
     scores: Any,
-) -> list[Excluded]:
-    """The best of the items that filters exclude."""
+    candidates: IntArray | None,
+) -> list[tuple[Any, int, str]]:
+    """The best of the items, among candidates if there are some, that filters exclude."""
     excluded: dict[str, Any] = {}
     for name, words in (
         ("tag_run", f"the last {rule.tag_run} items had its main tag"),
@@ -174,10 +198,12 @@ def _find_excluded(
         excluded["the user has seen it"] = trained.items.numbers(user.seen_ids)
     # Of several reasons, the last one here.
     reasons = {n: words for words, numbers in excluded.items() for n in numbers.tolist()}
-    order = torch.argsort(scores, descending=True, stable=True).tolist()
+    order = torch.argsort(scores, descending=True, stable=True).numpy()
+    if candidates is not None:
+        order = order[np.isin(order, candidates)]
     ranked = [
-        Excluded(trained.items.ids[number], rank, reasons[number])
-        for rank, number in enumerate(order, start=1)
+        (trained.items.ids[number], rank, reasons[number])
+        for rank, number in enumerate(order.tolist(), start=1)
         if number in reasons
     ]
     return ranked[:_EXCLUDED]

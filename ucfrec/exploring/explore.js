@@ -1,7 +1,6 @@
 "use strict";
-// The list follows the form at once. Without this script, the button does the same.
+// The lists follow the form at once. Without this script, its button does the same.
 const form = document.getElementById("form"), results = document.getElementById("results");
-const sliders = [...form.querySelectorAll("input[type=range]")];
 let waiting = 0, newest = 0;
 
 async function show() {
@@ -20,11 +19,20 @@ async function show() {
 }
 
 form.addEventListener("input", (event) => {
-  if (sliders.includes(event.target)) {
+  const slider = event.target.type === "range";
+  if (slider) {
     form.elements.custom.checked = true;
     form.querySelector(`output[for=${event.target.id}]`).textContent = Number(event.target.value).toPrecision(4).replace(/\.?0+$/, "");
   }
   clearTimeout(waiting);
-  waiting = setTimeout(show, 120);
+  waiting = setTimeout(show, slider ? 120 : 350);
+});
+results.addEventListener("click", (event) => {
+  const user = event.target.dataset.user;
+  if (user === undefined) return;
+  event.preventDefault();
+  form.elements.user.value = user;
+  form.elements.history.value = form.elements.time.value = "";
+  show();
 });
 form.addEventListener("submit", (event) => { event.preventDefault(); show(); });

@@ -1,9 +1,9 @@
 """The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from datetime import UTC, datetime
+from functools import cached_property, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,20 +18,20 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import explain, read_pasted
-from ucfrec.files.record import CARD
+from ucfrec.exploring.explain import Explained, explain, read_pasted
 from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
-from ucfrec.reporting.charts import Chart, line_chart
+from ucfrec.reporting.items import describe_item, features_by_id
 from ucfrec.reporting.page import render_report, template
-from ucfrec.reporting.results import find_quoted, read_evidence
+from ucfrec.reporting.results import read_findings
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PACKAGE = "ucfrec.exploring"
-_TITLES = ("title", "name")
-_IMAGES = ("image", "image_url", "picture")
+_UNSET = {"k": "10"}
+"""Numbers of the form where it has none; others are 0."""
+_EXAMPLES, _EXAMPLE_ROWS = 5, 10
+"""Number of example users, and of the rows that suit one."""
 _USERS_LISTED = 1000
 _MOST_ITEMS = 100
 _HEADERS = {
@@ -67,33 +67,18 @@ class Explorer:
         for trained in runs:
             trained.item_scorer()
         self.runs, self._results = tuple(runs), tuple(results)
-        self.values = sorted(
-            (
-                (row.target_return, estimates.name, row)
-                for estimates in read_evidence(results)[1]
-                if (row := find_quoted(estimates.rows)) and row.target_return is not None
-            ),
-            key=lambda value: value[:2],
-        )
-        """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
-        rows = [] if features is None else features.to_pylist()
-        self._features = {str(row.pop(schema.ITEM_ID)): row for row in rows}
+        self._findings = read_findings(self._results)
+        self._features = features_by_id(features)
 
     def page(self, fields: Mapping[str, str]) -> str:
         """The whole page, for the fields of the form by name; unknown ones are ignored."""
-        runs = []
-        for folder in (run.folder for run in self.runs):
-            text = "There is no model card."
-            if (folder / CARD).exists():
-                text = (folder / CARD).read_text(encoding="utf-8", errors="backslashreplace")
-            runs.append((folder.name, text))
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
             given=fields,
-            runs=runs,
-            sliders=self._list_sliders(fields),
-            values=self.values,
-            chart=self.values_chart,
+            unset=_UNSET,
+            names=[run.folder.name for run in self.runs],
+            sliders=self.sliders,
+            findings=self._findings,
             users=self.runs[0].user_ids[:_USERS_LISTED].tolist(),
         )
 
@@ -102,15 +87,16 @@ class Explorer:
         return template(_PACKAGE, "explore_results.html").render(**self._fill(fields))
 
     @cached_property
-    def values_chart(self) -> Chart | None:
-        """The values as one curve per policy; None with fewer than two targets."""
-        curves: dict[str, dict[float, float]] = {}
-        for target, _, row in self.values:
-            curves.setdefault(row.policy, {})[target] = row.value
-        if max(map(len, curves.values()), default=0) < 2:
-            return None
-        lines = [(name, style, curves[name]) for style, name in enumerate(curves)]
-        return line_chart("Off-policy value against the target return", "target return", lines)
+    def examples(self) -> list[Any]:
+        """Users that every run knows, who have about `_EXAMPLE_ROWS` rows; none without stores."""
+        ids, store = self.runs[0].user_ids, self.runs[0].training_store()
+        if store is None or not len(ids):
+            return []
+        rows = np.bincount(store.episode_values(schema.USER), store.lengths, len(ids))
+        ids = ids[np.argsort(np.abs(rows - _EXAMPLE_ROWS), kind="stable")]
+        for trained in self.runs:
+            ids = ids[trained.users.numbers(ids) >= 0]
+        return list(ids[:_EXAMPLES])
 
     @cached_property
     def reports(self) -> list[str]:
@@ -120,57 +106,69 @@ class Explorer:
     def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
         lists, error = [], ""
+        if "user" not in fields and self.examples:
+            fields = {**fields, "user": str(self.examples[0])}
         try:
             if fields.get("user", "").strip() or fields.get("history", "").strip():
-                k = round(_read_number(fields, "k", 1, _MOST_ITEMS, 10))
-                for trained in self.runs:
-                    history, rule = _read_history(trained, fields), _read_rule(trained, fields)
-                    reasons = explain(trained, rule, history, k, "keep_seen" not in fields)
-                    lists.append((trained.folder.name, str(rule), reasons))
+                lists = [(run.folder.name, self._explain(run, fields)) for run in self.runs]
         except InputError as fault:
-            lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in reasons.cards} for *_, reasons in lists]
-        cards = (card for *_, reasons in lists for card in reasons.cards)
+            error = str(fault)
+        ids = [{str(card.item_id) for card in reasons.cards} for _, reasons in lists]
+        cards = (card for _, reasons in lists for card in reasons.cards)
         return {
+            "user": (user := fields.get("user", "")),
+            "shown_to": "this user" if fields.get("history", "").strip() else f"user {user}",
+            "examples": self.examples,
             "lists": lists,
             "error": error,
             "common": ids[0] & ids[1] if len(ids) == 2 else None,
             "widest": max((abs(x) for card in cards for x in card.parts.values()), default=0) or 1,
-            "item": self._describe_item,
+            "item": partial(describe_item, self._features),
         }
 
-    def _list_sliders(self, fields: Mapping[str, str]) -> list[tuple[Any, ...]]:
-        """Numbers that a visitor can change: field of `DecisionRule`, label, range, step, value."""
-        trained, states = self.runs[0], self.runs[0].item_states
+    @cached_property
+    def sliders(self) -> list[tuple[Any, ...]]:
+        """Numbers that a visitor can change: field of the rule, label, range, step, default."""
+        trained, rule, states = self.runs[0], self.runs[0].rule, self.runs[0].item_states
         lowest, highest = float(trained.training_returns[0]), float(trained.training_returns[-1])
         span = max(highest - lowest, abs(highest), 1e-6)
-        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100)]
+        target = highest if rule.target is None else rule.target
+        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100, target)]
         if trained.reward_model is not None:
-            sliders.append(("reward_weight", "Reward weight", 0, 32, 0.25))
-        sliders.append(("temperature", "Temperature", 0, 2, 0.05))
+            sliders.append(("reward_weight", "Reward weight", 0, 32, 0.25, rule.reward_weight))
+        sliders.append(("temperature", "Temperature", 0, 2, 0.05, rule.temperature))
         if states is not None and bool((states.tags >= 0).any()):
-            sliders.append(("tag_window", "Exclude tags of the last items", 0, 10, 1))
-        set_to = []
-        for name, label, low, high, step in sliders:
-            value = getattr(trained.rule, name)
-            # Where a number is wrong, the list says so.
-            if "custom" in fields and fields.get(name):
-                with suppress(InputError):
-                    value = _read_number(fields, name, low, high)
-            set_to.append((name, label, low, high, step, highest if value is None else value))
-        return set_to
+            sliders.append(("tag_window", "Exclude tags of the last", 0, 10, 1, rule.tag_window))
+        return sliders
 
-    def _describe_item(self, item_id: Any) -> dict[str, str]:
-        """Title, picture and other features of an item."""
-        row = {**self._features.get(str(item_id), {})}
-        title = next((row.pop(name) for name in _TITLES if name in row), None)
-        image = next((str(row.pop(name)) for name in _IMAGES if name in row), "")
-        features = "; ".join(f"{name} {value}" for name, value in row.items() if value)
-        return {
-            "title": str(title or item_id),
-            "image": image if image.startswith(("http://", "https://")) else "",
-            "features": features[:200],
+    def _explain(self, trained: TrainedPolicy, fields: Mapping[str, str]) -> Explained:
+        """What a run recommends as the form asks for, by its own rule or that of the sliders."""
+        numbers = {
+            name: _read_number(fields, name, low, high)
+            for name, _, low, high, *_ in self.sliders
+            if name in fields and "custom" in fields
         }
+        candidates = [line.strip() for line in fields.get("candidates", "").split("\n")]
+        return explain(
+            trained,
+            replace(trained.rule, **numbers),
+            _read_history(trained, fields),
+            _read_number(fields, "k", 1, _MOST_ITEMS),
+            "keep_seen" not in fields,
+            candidates=[item_id for item_id in candidates if item_id] or None,
+            time_ms=_read_time(fields),
+            seed=_read_number(fields, "seed", 0, 2**31),
+        )
+
+
+def _read_time(fields: Mapping[str, str]) -> int | None:
+    """The moment of the decision in milliseconds; None for right after the last row."""
+    text = fields.get("time", "").strip()
+    try:
+        moment = datetime.fromisoformat(text) if text else None
+    except ValueError:
+        raise InputError(f"time is {text[:40]!r}; give one such as 2024-05-01T10:00") from None
+    return None if moment is None else round(1000 * moment.replace(tzinfo=UTC).timestamp())
 
 
 def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
@@ -182,43 +180,20 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
         )
-    if trained.training_store() is None:
-        raise InputError(
-            f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
-            "history instead"
-        )
+    trained.require_store("paste a history instead")
     return next(read_histories(trained, None, None, [user]))
 
 
-def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:
-    """The run's own rule, or that of the sliders."""
-    if fields.get("custom") is None:
-        return trained.rule
-    changes: dict[str, Any] = {
-        name: _read_number(fields, name, -1e12, 1e12)
-        for name in ("target", "reward_weight", "temperature")
-        if name in fields
-    }
-    if "tag_window" in fields:
-        changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 10))
-    return replace(trained.rule, **changes)
-
-
-def _read_number(
-    fields: Mapping[str, str],
-    name: str,
-    low: float,
-    high: float,
-    default: float = 0.0,
-) -> float:
-    text = fields.get(name, "")
+def _read_number(fields: Mapping[str, str], name: str, low: float, high: float) -> Any:
+    """A number of the form, as an integer if it is one."""
+    text = fields.get(name, "").strip() or _UNSET.get(name, "0")
     try:
-        value = float(text) if text.strip() else default
+        value = float(text)
     except ValueError:
         value = float("nan")
     if not low <= value <= high:
         raise InputError(f"{name} is {text[:40]!r}; give a number from {low:g} to {high:g}")
-    return value
+    return int(value) if value.is_integer() else value
 
 
 def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> Starlette:

@@ -490,12 +490,12 @@ class Recommender:
 
         Args:
             file: HTML file to write.
-            results: what `evaluate` and `ope` returned, or files of it; one or several.
+            results: what `evaluate`, `ope`, `rank` returned, or files of `--json`; one or several.
             items: file with item features to show beside sample recommendations.
         """
-        what = "what evaluate or ope returned, or files of it"
+        what = "what evaluate, ope or rank returned, or files of --json"
         tables = [results] if isinstance(results, ResultTable) else results
-        tables = require_list("results", tables, what, Evaluation, OffPolicyReport, Path, str)
+        tables = require_list("results", tables, what, ResultTable, Path, str)
         with tempfile.TemporaryDirectory() as scratch, use_words_of_python():
             files = []
             for number, result in enumerate(tables):

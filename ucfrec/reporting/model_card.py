@@ -67,11 +67,7 @@ def write_card(run: Path) -> Path:
 
 
 def add_measurement(
-    run: Path,
-    how: str,
-    of: str,
-    values: Mapping[str, object],
-    remarks: Sequence[str] = (),
+    run: Path, how: str, of: str, values: Mapping[str, object], remarks: Sequence[str] = ()
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 
@@ -93,7 +89,7 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
     of = f"{row.environment}, {_format_rule(row)}, checkpoint {row.checkpoint}"
-    values = _select_values(row, names, {"R_cum": row.interval}) | {"seed": row.evaluation_seed}
+    values = _select_values(row, names) | {"seed": row.evaluation_seed}
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
@@ -107,19 +103,14 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     of += ", pages" if row.conditions["pages"] else ""
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
-    values = _select_values(row, names, {"R_cum": row.interval}) | {"logged": rows[LOGGED].value}
+    values = _select_values(row, names) | {"logged": rows[LOGGED].value}
     warnings = [text for text in report.warnings if text not in report.verdict.reasons]
     add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *warnings])
 
 
-def add_ranking(
-    run: Path,
-    row: ResultRow,
-    on: str,
-    remarks: Sequence[str] = (),
-) -> None:
+def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
-    values = _select_values(row, Ranking.headings, row.details["intervals"])
+    values = _select_values(row, Ranking.headings)
     of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
     of += f", liked: {row.conditions['liked']}"
     add_measurement(run, "ucfrec rank", of, values, remarks)
@@ -129,29 +120,20 @@ def _format_rule(row: ResultRow) -> str:
     return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
 
 
-def _select_values(
-    row: ResultRow, names: Sequence[str], intervals: Mapping[str, Sequence[float] | None]
-) -> dict[str, object]:
+def _select_values(row: ResultRow, names: Sequence[str]) -> dict[str, object]:
     """The named values, with the intervals of those that have one."""
     values = dict(zip(names, map(row.as_line().get, names), strict=True))
-    for name in values.keys() & row.metrics:
-        if (ends := intervals.get(name)) is not None:
-            values[name] = f"{values[name]:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
+    for name, (low, high) in row.intervals.items():
+        if name in values:
+            values[name] = f"{values[name]:.4g} [{low:.4g}, {high:.4g}]"
     return values
 
 
 def _read_measured(run: Path) -> list[dict[str, Any]]:
-    file = run / MEASURED
+    file, names = run / MEASURED, ("how", "of", "values", "said")
     with damage_explained(file, "restore or remove it"):
-        return [
-            {
-                "how": row["how"],
-                "of": row["of"],
-                "values": {**row["values"]},
-                "said": [*row["said"]],
-            }
-            for row in (read_json(file) if file.exists() else ())
-        ]
+        rows = read_json(file) if file.exists() else []
+        return [{name: row[name] for name in names} | {"values": {**row["values"]}} for row in rows]
 
 
 def describe_data(record: RunRecord) -> dict[str, object]:

@@ -1,46 +1,36 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
+from ucfrec.files.record import CARD
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.logs.summary import format_report
+from ucfrec.reporting.items import Features, features_by_id, read_features
 from ucfrec.reporting.model_card import describe_data, describe_user_model
-from ucfrec.reporting.results import (
-    conclude,
-    draw_environments,
-    draw_estimates,
-    draw_forest,
-    draw_frontier,
-    read_evidence,
-)
+from ucfrec.reporting.results import conclude_update, read_findings
 from ucfrec.reporting.tables import Table
 from ucfrec.reporting.training import (
     POINTS,
-    REFERENCES,
     Curves,
     draw_curves,
-    draw_distributions,
-    draw_moves,
-    read_features,
     select_curves,
     tabulate_augmentation,
     tabulate_samples,
 )
 from ucfrec.results.statistics import grouped
-from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_candidates, read_record
+from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
 
 _REMEDY = "restore it or train again"
@@ -65,17 +55,9 @@ class _Run:
         logged = max((step for curve in self.logged.values() for step in curve), default=0)
         return f"not finished: logged up to step {logged:,} of {steps:,}"
 
-    @property
-    def references(self) -> Mapping[str, float]:
-        """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
-        return (self.record.reference_losses or {}) if "action_loss" in self.logged else {}
-
 
 def write_report(
-    out: Path,
-    runs: Sequence[Path],
-    results: Sequence[Path] = (),
-    items: Path | None = None,
+    out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
 ) -> None:
     """Write `render_report` to a file, atomically.
 
@@ -94,22 +76,19 @@ def render_report(
     """A self-contained HTML page about `runs`; those on the same data share a section and charts.
 
     Args:
-        results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`.
+        results: files of `--json`, of any command, or of result rows.
         items: item features to show with the sample recommendations, for `read_features`.
 
     Raises:
-        InputError: a folder is not a run, or a file has no such rows or features.
+        InputError: a folder is not a run, or a file has no results or features.
     """
     loaded = _read_runs(runs)
-    environments, estimates = read_evidence(results)
-    with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
-        evaluated = {
-            "verdict": conclude(environments, estimates),
-            "environments": draw_environments(environments),
-            "estimates": draw_estimates(estimates),
-            "forest": draw_forest(estimates),
-        }
-    features = None if items is None else read_features(items, [run.record.data for run in loaded])
+    findings = read_findings(results)
+    for run in loaded:
+        if (update := run.record.update) and update.verdict:
+            findings.append(conclude_update(update.of, update.verdict))
+    table = None if items is None else read_features(items, [run.record.data for run in loaded])
+    features = features_by_id(table)
     warnings, sections = [], []
     for group in grouped(loaded, lambda run: run.record.fingerprint).values():
         for run in group:
@@ -118,7 +97,12 @@ def render_report(
         with damage_explained(group[0].folder / RUN, _REMEDY):
             sections.append(_fill_section(group, features))
     return template("ucfrec.reporting", "report.html").render(
-        version=__version__, warnings=warnings, sections=sections, points=POINTS, **evaluated
+        version=__version__,
+        findings=findings,
+        answers=grouped((f for f in findings if f.answer), lambda finding: finding.answer),
+        warnings=warnings,
+        sections=sections,
+        points=POINTS,
     )
 
 
@@ -161,44 +145,41 @@ def _list_warnings(run: _Run) -> list[str]:
     return [text for text in warnings if text]
 
 
-def _fill_section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
+def _fill_section(runs: Sequence[_Run], features: Features) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
     names, record = [run.name for run in runs], runs[0].record
-    edited, user_models, frontiers, samples = [], [], [], []
-    for style, run in enumerate(runs):
-        if run.augmentation is not None:
-            edited.append((run.name, style, run.augmentation))
+    user_models, samples = [], []
+    augmented = {run.name: run.augmentation for run in runs if run.augmentation is not None}
+    for run in runs:
         if parts := describe_user_model(run.record):
             table = Table.of_columns("User model, on held-out rows", {"value": parts})
             user_models.append((run.name, table))
-        if picture := draw_frontier(run.record, read_candidates(run.folder)):
-            frontiers.append((run.name, *picture))
         if run.record.sizes["items"]:
             samples.append((run.name, tabulate_samples(run.folder, features)))
-    pictures, quantiles = draw_distributions(record.data)
     return {
         "runs": runs,
         "store": record.store,
         "data": Table.of_columns("Training data", {"value": describe_data(record)}),
         "rows": format_report(record.data.model_dump()) if record.data.rows_read else "",
-        "pictures": pictures,
-        "quantiles": quantiles,
         "summary": _summarise(runs),
-        "curves": draw_curves(names, [r.logged for r in runs], [r.references for r in runs]),
-        "augmentation": tabulate_augmentation(edited) if edited else None,
-        "moves": draw_moves(edited),
+        "curves": draw_curves(names, [run.logged for run in runs]),
+        "augmentation": tabulate_augmentation(augmented) if augmented else None,
         "user_models": user_models,
-        "frontiers": frontiers,
         "samples": samples,
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
+        "cards": [
+            (run.name, card.read_text("utf-8", errors="backslashreplace"))
+            for run in runs
+            if (card := run.folder / CARD).exists()
+        ],
     }
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
     columns = {}
     for run in runs:
-        fit, losses = run.record.policy, run.references
+        fit, losses = run.record.policy, run.record.reference_losses or {}
         columns[run.name] = {
             "policy": run.record.name,
             "seed": str(run.record.seed),
@@ -206,7 +187,8 @@ def _summarise(runs: Sequence[_Run]) -> Table:
             "best validation loss": fit and fit.best_validation,
             "at step": fit and fit.best_step,
             "wall time, s": fit and run.record.wall_time_s,
-            **{f"loss with {n}": losses[key] for key, n in REFERENCES.items() if key in losses},
+            # Comparable where the loss is the log-likelihood of items.
+            **{f"loss by {n}": loss for n, loss in losses.items() if "action_loss" in run.logged},
         }
     return Table.of_columns("Runs", columns)
 

@@ -1,4 +1,4 @@
-"""Results of `ucfrec evaluate` and `ucfrec ope` in the report: conclusions, charts and tables.
+"""Results of commands in the report: what each of them answers, one picture, and tables.
 
 Conclusions call two results different only if their 95% intervals do not overlap, which is stricter
 than a test of the difference at 5%.
@@ -6,254 +6,216 @@ than a test of the difference at 5%.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import COLUMNS
+from pydantic import TypeAdapter
+
+from ucfrec.errors import damage_explained
+from ucfrec.files.atomic import read_json
+from ucfrec.off_policy.ab_test import Comparison
 from ucfrec.off_policy.estimators import LOGGED, SUITE
-from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
-from ucfrec.reporting.tables import Table, evaluation_line, format_value
-from ucfrec.results.rows import ResultRow, read_results
+from ucfrec.reporting.tables import Table, format_value
+from ucfrec.results.charts import Chart, Interval, interval_chart
+from ucfrec.results.rows import ResultRow, name_rows, read_results, select_intervals
 from ucfrec.results.statistics import grouped, summary
-from ucfrec.runs.record import Candidate, RunRecord
+from ucfrec.runs.record import UpdateVerdict
+from ucfrec.updating.verdict import describe
 
-_METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
-_SEEDS = ("seed", "train_seed")
 _STEP = "R_step"
 """Metric of rows per step, where only some steps of the logs have propensities."""
+_OF_SESSION = ("R_cum", "effective_sessions", "largest_weight", "sessions", "overlap")
+_OF_STEP = (_STEP, "effective_steps", "largest_weight")
+"""Columns of the tables of estimates."""
+_WORDS = {"R_cum": "Return per episode"}
+"""Names of metrics in conclusions."""
 
 
 @dataclass(frozen=True)
-class Estimates:
-    """The estimates of one `ucfrec ope` for one policy."""
+class Finding:
+    """What results say of one thing."""
 
-    name: str
-    rows: Sequence[ResultRow]
-    """One row per estimator, and that of the logged sessions' own return."""
-    warnings: tuple[str, ...] = ()
-    steps: Sequence[ResultRow] = ()
-    """Rows per step, with that of the logged steps."""
+    subject: str
+    """What was measured."""
+    answer: str
+    """The conclusion, up to a colon, and the numbers or reasons that it has; or nothing."""
+    tables: Sequence[Table] = ()
+    remarks: Sequence[str] = ()
+    """What to know of the numbers."""
+    chart: Chart | None = None
+    parts: list[Table] = field(default_factory=list)
+    """Guardrails and groups, which a page shows unfolded."""
 
 
-Environments = Mapping[str, Sequence[ResultRow]]
-"""Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
-
-
-def read_evidence(paths: Sequence[Path]) -> tuple[Environments, Sequence[Estimates]]:
-    """Read result rows from JSON lines (files named `.jsonl`) or JSON.
+def read_findings(paths: Sequence[Path]) -> list[Finding]:
+    """What the results in files of `--json` and files of result rows (`.jsonl`) say; all estimates
+    from logs share a chart, that of the first of them.
 
     Raises:
-        InputError: a file is missing or has a row without the required fields.
+        InputError: a file is missing or holds no results.
     """
-    environments: dict[str, list[ResultRow]] = {}
-    estimates: list[Estimates] = []
+    findings, rows = list[Finding](), list[ResultRow]()
     for path in paths:
-        calls: list[list[ResultRow]] = []
-        for number, row in enumerate(read_results(path), start=1):
-            by_step = row.suite == SUITE and row.metric == _STEP
-            session = row.metric == "R_cum" and (row.interval is not None or row.suite == SUITE)
-            if not (session or by_step):
-                raise InputError(
-                    f"{path}, row {number}, has no R_cum with an interval; give rows that `ucfrec "
-                    "evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
-                )
-            if row.suite != SUITE:
-                environments.setdefault(row.environment or row.task, []).append(row)
-            # The rows of one call of `ucfrec ope` begin with `logged`.
-            elif (row.method == LOGGED and not by_step) or not calls:
-                calls.append([row])
-            else:
-                calls[-1].append(row)
-        estimates += map(_group_estimates, calls)
-    return environments, estimates
-
-
-def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
-    steps = [row for row in group if row.metric == _STEP]
-    rows = [row for row in group if row.metric != _STEP]
-    first = next((row for row in rows if row.method != LOGGED), group[0])
-    name, choice, run = first.policy, first.conditions.get("choice"), first.conditions.get("run")
-    if first.details.get("selection") is not None:
-        name += f" ({first.details.get('candidate')})"
-    else:
-        name += ("" if choice is None else f" ({choice})") + ("" if run is None else f" of {run}")
-    warnings = (row.details.get("warnings") for row in group)
-    texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
-    return Estimates(name, rows, tuple(dict.fromkeys(texts)), steps)
-
-
-def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
-    """The row that the verdict is of, if it has an interval."""
-    return next((r for r in rows if r.interval and r.method == r.details.get("verdict_of")), None)
-
-
-def draw_environments(environments: Environments) -> list[tuple[Chart, Table]]:
-    """Bar chart and table of each environment."""
-    pictures = []
-    for environment, rows in environments.items():
-        lines, names = [evaluation_line(row) for row in rows], []
-        for line in lines:
-            # The policy, with the fields that differ if it has several rows.
-            same = [ln for ln in lines if ln["policy"] == line["policy"]]
-            parts = (
-                f", {key} {format_value(line.get(key))}"
-                for key in ("run", "checkpoint", *_SEEDS)
-                if any(ln.get(key) != line.get(key) for ln in same)
-            )
-            names.append(line["policy"] + "".join(parts))
-        columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
-        title, caption = f"R_cum in {environment}", f"{environment}: means of episodes"
-        heads = {column: column for column in ("R_cum", *columns)}
-        pictures.append(_draw_rows(title, caption, heads, names, rows, "policy"))
-    return pictures
-
-
-def draw_estimates(
-    all_estimates: Sequence[Estimates],
-) -> list[tuple[list[tuple[Chart, Table]], tuple[str, ...]]]:
-    """Charts and tables, per session and step, and warnings of each policy with estimates."""
-    largest = {"largest_weight": "share of the largest weight"}
-    by_session = {"R_cum": "mean return of a session", "effective_sessions": "effective sample"}
-    by_session |= {**largest, "sessions": "sessions", "overlap": "overlap"}
-    by_step = {_STEP: "mean reward of a step", "effective_steps": "effective sample", **largest}
-    pictures = []
-    for estimates in all_estimates:
-        parts, name = [], estimates.name
-        for rows, unit, columns, title, caption in (
-            (estimates.rows, "sessions", by_session, "Mean return of a session", "Estimates"),
-            (estimates.steps, "steps", by_step, "Mean reward of a step with a propensity",
-             "Estimates per step"),
-        ):  # fmt: skip
-            names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
-            if names:
-                title, caption = f"{title}: {name}", f"{caption} for {name}"
-                parts.append(_draw_rows(title, caption, columns, names, rows))
-        pictures.append((parts, estimates.warnings))
-    return pictures
-
-
-def _draw_rows(
-    title: str,
-    caption: str,
-    columns: Mapping[str, str],
-    names: Sequence[str],
-    rows: Sequence[ResultRow],
-    corner: str = "",
-) -> tuple[Chart, Table]:
-    """Chart of the intervals, and table of the columns, {value: head}, the first with intervals."""
-    intervals, body = [], []
-    for name, row in zip(names, rows, strict=True):
-        first, *values = map(evaluation_line(row).get, columns)
-        ends = "–"
-        if row.interval is not None:
-            low, high = row.interval
-            intervals.append(Interval(name, row.value, low, high))
-            ends = ", ".join(map(format_value, row.interval))
-        body.append((name, [f"{format_value(first)} [{ends}]", *values]))
-    chart = interval_chart(f"{title}, with 95% intervals", intervals)
-    return chart, Table(caption, list(columns.values()), body, corner)
-
-
-def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
-    """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
-    intervals, logged = [], set()
-    for estimates in all_estimates:
-        logged |= {row.value for row in estimates.rows if row.method == LOGGED}
-        if (row := find_quoted(estimates.rows)) and row.interval:
-            name, reliable = f"{estimates.name}: {row.method}", row.details.get("reliable") is True
-            low, high = row.interval
-            intervals.append(Interval(name, row.value, low, high, reliable))
-    if not intervals:
-        return None
-    # The line is of one set of logs; several have a line each in their own charts.
-    title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
-    return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
-
-
-def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
-    """The highest estimated value of the rules that leave so many effective users of the log; None
-    where the log has no propensities."""
-    if record.rule is None:
-        return None
-    places = [
-        (c.evidence.effective_users, c.value, c.rule, c.evidence.interval)
-        for c in candidates
-        if c.value is not None and c.evidence and c.evidence.effective_users is not None
+        if path.suffix == ".json" and isinstance(values := read_json(path), dict) and values:
+            with damage_explained(path, "write it again"):
+                findings.append(_read_object(path.name, values))
+        else:
+            rows += read_results(path)
+    kinds = grouped(rows, lambda row: row.suite == SUITE and row.metric in ("R_cum", _STEP))
+    measured = kinds.get(False, ())
+    tables = grouped(measured, lambda row: (row.table, row.environment or row.task, row.metric))
+    return [
+        *_conclude_estimates(kinds.get(True, ())),
+        *(_conclude_rows(f"{key[0]}, {key[1]}", group) for key, group in tables.items()),
+        *findings,
     ]
-    curve, body = dict[float, float](), []
-    for users, value, rule, ends in sorted(places, key=lambda place: (-place[0], -place[1])):
-        if value > max(curve.values(), default=-math.inf):
-            curve[users] = value
-            between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
-            body.append((str(rule), [value, f"{users:.0f}", between]))
-    if not curve:
-        return None
-    curves = [("best rule", 0, curve)]
-    if chosen := [place for place in places if place[2] == record.rule.rule]:
-        curves.append(("chosen rule", 1, dict([chosen[0][:2]])))
-    title = "Value in the search for a rule, against evidence"
-    chart = line_chart(title, "effective users of the log", curves)
-    head = ["value in the search", "effective users", "off-policy interval"]
-    return chart, Table(title, head, body, "rule")
 
 
-NO_RESULTS = (
-    "No results are given, so the returns of these policies are unknown. A validation loss "
-    "measures how well logged choices are predicted, not the return. Evaluate the policies in a "
-    "simulator (ucfrec evaluate --json) or from logs (ucfrec ope --json), and give the rows with "
-    "--results."
-)
+def _conclude_estimates(rows: Sequence[ResultRow]) -> list[Finding]:
+    """What `ucfrec ope` says of all rules in a picture, and of each; the rows of one begin with the
+    logged sessions' own return."""
+    calls: list[list[ResultRow]] = []
+    for row in rows:
+        if not calls or (row.method == LOGGED and row.metric != _STEP):
+            calls.append([])
+        calls[-1].append(row)
+    if not calls:
+        return []
+    title = "Mean return of a session, with 95% intervals; grey: the data cannot say"
+    intervals, level = select_intervals(rows)
+    first = [next((r for r in call if r.method != LOGGED), call[0]) for call in calls]
+    choice = str(first[0].details.get("selection", ""))
+    findings = [Finding("The candidates", choice, chart=interval_chart(title, intervals, level))]
+    for name, call, row in zip(name_rows(first), calls, first, strict=True):
+        tables = [
+            _tabulate(f"{caption} for {name}", columns, [r.method for r in group], group)
+            for caption, columns in (("Estimates", _OF_SESSION), ("Estimates per step", _OF_STEP))
+            if (group := [r for r in call if r.metric == columns[0]])
+        ]
+        answer = answer_of(row)
+        if len(calls) > 1 and row.details.get("reliable") is not True:
+            # The reasons are among the warnings.
+            answer = answer.partition(":")[0]
+        parts = [
+            _tabulate_parts(f"{key.capitalize()} of {name}", row.details[key])
+            for key in ("guardrails", "groups")
+            if row.details.get(key)
+        ]
+        warnings = row.details.get("warnings", ())
+        findings.append(Finding(name, answer, tables, warnings, parts=parts))
+    return findings
 
 
-_VERDICTS = {1: "Higher", -1: "Lower", 0: "Open, as intervals overlap"}
+def _tabulate_parts(caption: str, parts: Sequence[Mapping[str, Any]]) -> Table:
+    """Guardrails or groups, each with a name, evidence and other values; where a reason speaks
+    against the evidence, the reason takes the place of its number."""
+    body = []
+    for part in parts:
+        name, *cells = part.values()
+        for place, cell in enumerate(cells):
+            if isinstance(cell, Mapping) and (cell["reasons"] or cell["low"] is None):
+                cells[place] = "; ".join(["–", *cell["reasons"][:1]])
+            elif isinstance(cell, Mapping):
+                cells[place] = Interval(name, cell["value"], cell["low"], cell["high"]).numbers
+        body.append((str(name), cells))
+    return Table(caption, list(parts[0])[1:], body)
 
 
-def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> list[str]:
-    """One paragraph per environment, then one per policy with estimates from logs."""
-    conclusions = [_conclude(name, rows) for name, rows in environments.items()]
-    return conclusions + [_quote(estimates) for estimates in all_estimates] or [NO_RESULTS]
+def answer_of(row: ResultRow) -> str:
+    """What `ucfrec ope` concluded of a policy, as its rows say."""
+    return str(row.details.get("verdict", "The rows have no verdict of ucfrec ope"))
 
 
-def _collect_returns(rows: Sequence[ResultRow]) -> list[tuple[int, Interval]]:
-    """Number of training seeds, 0 for a built-in policy, with mean R_cum and ends of all intervals,
-    of each policy and checkpoint; trained and high ones first."""
+def _conclude_rows(place: str, rows: Sequence[ResultRow]) -> Finding:
+    """How methods compare by their rows' metric, in a simulator or on logs."""
+    rows, metric = sorted(rows, key=lambda row: -row.value), rows[0].metric
+    columns = [*dict.fromkeys(name for row in rows for name in (metric, *row.metrics))]
+    caption = f"{place}: {metric} with 95% intervals, and other measures"
+    table = _tabulate(caption, columns, name_rows(rows), rows)
+    title = f"{_WORDS.get(metric, metric)}, with 95% intervals: {place}"
+    chart = interval_chart(title, select_intervals(rows)[0])
+    return Finding(place, _compare(metric, rows), [table], (), chart)
+
+
+def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
+    """What a JSON object of `ucfrec compare`, of the record of an updated run or of another command
+    says."""
+    if "always_low" in values:
+        return _conclude_comparison(TypeAdapter(Comparison).validate_python(values))
+    if update := values.get("update"):
+        return conclude_update(update["of"], UpdateVerdict.model_validate(update["verdict"]))
+    rows = {key: value for key, value in values.items() if not isinstance(value, (dict, list))}
+    return Finding(name, "", [Table.of_columns(name, {"value": rows})])
+
+
+def _conclude_comparison(test: Comparison) -> Finding:
+    """What an A/B test says."""
+    planned, always = (test.low, test.high), (test.always_low, test.always_high)
+    intervals = [
+        Interval(when, test.difference, low, high)
+        for when, (low, high) in (("as planned", planned), ("whenever looked at", always))
+        if low is not None and high is not None
+    ]
+    first, second = test.arms
+    title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
+    chart = interval_chart(title, intervals, ("no difference", 0.0))
+    remarks = str(test).splitlines()
+    return Finding(f"The A/B test of {first} and {second}", test.conclusion, (), remarks, chart)
+
+
+def conclude_update(of: str, verdict: UpdateVerdict) -> Finding:
+    """What the newest rows say of an updated run against the one `of` before."""
+    intervals = [
+        Interval(row.measure, row.value, row.low, row.high, not row.doubt)
+        for row in verdict.differences
+    ]
+    title = f"Updated run less {of}, with 95% intervals; grey: the data cannot say"
+    answer, *remarks = describe(verdict).splitlines()
+    chart = interval_chart(title, intervals, ("no difference", 0.0))
+    answer = answer.removeprefix("verdict").strip().capitalize()
+    return Finding(f"The update of {of}", answer, (), remarks, chart)
+
+
+def _tabulate(
+    caption: str, columns: Sequence[str], names: Sequence[str], rows: Sequence[ResultRow]
+) -> Table:
+    """A table of the columns, the first with intervals."""
+    body = []
+    for name, row in zip(names, rows, strict=True):
+        first, *values = map(row.as_line().get, columns)
+        ends = ", ".join(map(format_value, row.interval or (None,)))
+        body.append((name, [f"{format_value(first)} [{ends}]", *values]))
+    return Table(caption, columns, body, "method")
+
+
+_VERDICTS = {1: "Higher", -1: "Lower", 0: "Open, as intervals overlap or are not known"}
+
+
+def _compare(metric: str, rows: Sequence[ResultRow]) -> str:
+    """The best trained policy, and how the others compare: all intervals of the trainings of one
+    with all intervals of the others."""
     groups = grouped(rows, lambda row: (row.method, row.checkpoint))
-    policies, returns = [policy for policy, _ in groups], []
+    policies, returns = [policy for policy, _ in groups], list[tuple[int, Interval]]()
     for (policy, checkpoint), group in groups.items():
         name = policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}"
-        trainings = len({row.training_seed for row in group} - {None})
         value = summary(row.value for row in group).mean
-        lows, highs = zip(*(row.interval for row in group if row.interval), strict=True)
-        name += f" ({format_value(value)})"
-        returns.append((trainings, Interval(name, value, min(lows), max(highs))))
-    return sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
-
-
-def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
-    """The best trained policy, and how the others compare: all intervals with all intervals."""
-    (trainings, best), *returns = _collect_returns(rows)
-    built_in = sum(not seeds for seeds, _ in returns)
+        lows, highs = zip(*(row.interval or (-math.inf, math.inf) for row in group), strict=True)
+        interval = Interval(f"{name} ({format_value(value)})", value, min(lows), max(highs))
+        returns.append((len({row.training_seed for row in group} - {None}), interval))
+    (trainings, best), *rivals = sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
     if not trainings:
-        names = ", ".join(policy.name for policy in (best, *(policy for _, policy in returns)))
-        return f"In {environment}, only built-in policies were evaluated: {names}."
-    text = (
-        f"In {environment}, {best.name} has the highest return per episode of "
-        f"{len(returns) + 1 - built_in} trained (95% intervals {format_value(best.low)} to "
-        f"{format_value(best.high)}; trainings: {trainings})."
-    )
-    groups = grouped(returns, lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low))
-    for above, policies in groups.items():
-        text += f" {_VERDICTS[above]}: {', '.join(policy.name for _, policy in policies)}."
-    if not built_in:
+        return f"Only built-in policies: {', '.join(policy.name for _, policy in returns)}."
+    trained = sum(seeds > 0 for seeds, _ in returns)
+    text = f"{best.name} has the highest {_WORDS.get(metric, metric).lower()} of {trained} trained:"
+    if math.isfinite(best.low):
+        text += f" 95% intervals {format_value(best.low)} to {format_value(best.high)};"
+    text += f" trainings: {trainings}."
+    sides = grouped(rivals, lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low))
+    for side, beside in sides.items():
+        text += f" {_VERDICTS[side]}: {', '.join(policy.name for _, policy in beside)}."
+    if trained == len(returns):
         text += " No built-in policy (random, logging or best) was evaluated to compare it with."
     if trainings < 2:
         text += " It was trained once; the spread over training seeds is unknown."
     return text
-
-
-def _quote(estimates: Estimates) -> str:
-    """What `ucfrec ope` concluded of a policy, as its rows say."""
-    verdicts = filter(None, (row.details.get("verdict") for row in estimates.rows))
-    verdict = next(verdicts, "the rows have no verdict of ucfrec ope")
-    return f"For {estimates.name}: {verdict}."

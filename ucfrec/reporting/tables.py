@@ -25,7 +25,7 @@ class Table:
     """Head of the column of row names."""
 
     @classmethod
-    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[str, object]]) -> "Table":
+    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[Any, object]]) -> "Table":
         """A table of columns by name, with a row for every name in at least one of them."""
         names = dict.fromkeys(name for column in columns.values() for name in column)
         rows = [(name, [column.get(name) for column in columns.values()]) for name in names]
@@ -50,18 +50,12 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> st
     return "\n".join(f"| {' | '.join(map(_format_text, line))} |" for line in table)
 
 
-def evaluation_line(row: ResultRow) -> dict[str, Any]:
-    """A row with its values by the column names of tables of evaluations."""
-    seeds = {"seed": row.evaluation_seed, "train_seed": row.training_seed}
-    texts = {name: str(seed) for name, seed in seeds.items() if seed is not None}
-    return {**row.as_line(), **dict.fromkeys(seeds), "policy": row.method, **texts}
-
-
 def evaluation_table(rows: Iterable[ResultRow]) -> str:
     """Rows of evaluations as an aligned text table."""
     returns = ("R_cum", "R_avg_pooled", "R_avg_episode")
     columns = ("environment", "policy", *returns, "length", "episodes", "seed")
-    return format_rows([evaluation_line(row) for row in rows], columns)
+    lines = [{**row.as_line(), "policy": row.method, "seed": row.evaluation_seed} for row in rows]
+    return format_rows(lines, columns)
 
 
 def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
+    from ucfrec.results.charts import Interval
+
 
 def plain(value: Any) -> Any:
     """`value` as JSON; numbers that are not finite are None."""
@@ -115,6 +117,12 @@ class ResultRow(RowKey):
     def value(self) -> float:
         """Value of `metric`, which tables show."""
         return self.metrics[self.metric]
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95% intervals by metric."""
+        ends = {self.metric: self.interval, **self.details.get("intervals", {})}
+        return {name: (pair[0], pair[1]) for name, pair in ends.items() if pair}
 
     def __getitem__(self, name: str) -> Any:
         """A field, condition, metric or end of the interval by its name, as in `as_line`."""
@@ -258,6 +266,69 @@ def _write(path: Path, text: str, rows: Sequence[ResultRow]) -> None:
         scratch.write_bytes((text + lines).encode())
 
 
+def name_rows(rows: Sequence[ResultRow]) -> list[str]:
+    """A name of each row: its method, or of estimates from logs its policy, with what differs from
+    rows of the same."""
+    methods = [row.policy if _VERDICT in row.details else row.method for row in rows]
+    parts: list[dict[str, object]] = [
+        {
+            **row.details.get("decision_rule", {}),
+            **{name: value for name, value in row.conditions.items() if name not in _IMPLIED},
+            "checkpoint": row.checkpoint,
+            "seed": row.evaluation_seed,
+            "training seed": row.training_seed,
+        }
+        for row in rows
+    ]
+    names = []
+    for method, values in zip(methods, parts, strict=True):
+        same = [part for name, part in zip(methods, parts, strict=True) if name == method]
+        texts = [
+            _describe_part(name.replace("_", " "), value)
+            for name, value in values.items()
+            if any(part.get(name) != value for part in same)
+        ]
+        names.append(", ".join([method, *texts]))
+    return names
+
+
+def _describe_part(name: str, value: object) -> str:
+    if value is None or value is False:
+        return f"no {name}"
+    text = f"{value:g}" if type(value) is float else value
+    return name if value is True else f"{name} {text}"
+
+
+def select_intervals(
+    rows: Sequence[ResultRow], metric: str | None = None
+) -> "tuple[list[Interval], tuple[str, float] | None]":
+    """What a picture of rows shows of a metric, by default that of each row: their intervals, and a
+    level to compare them with. Of the estimates of `ucfrec ope`, these are the ones that verdicts
+    are of, and the logged return, if the logs are the same for all."""
+    from ucfrec.results.charts import Interval
+
+    level, judged = None, metric is None and any(_VERDICT in row.details for row in rows)
+    if judged:
+        sessions = [row for row in rows if row.metric == "R_cum"]
+        logged = {row.value for row in sessions if row.policy == _BEHAVIOR}
+        level = ("logged", logged.pop()) if len(logged) == 1 else None
+        rows = [row for row in sessions if row.policy != _BEHAVIOR]
+    intervals = dict[object, Interval]()
+    for number, (name, row) in enumerate(zip(name_rows(rows), rows, strict=True)):
+        measure, key = metric or row.metric, name if judged else number
+        is_quoted = row.method == row.details.get("verdict_of")
+        if measure in row.metrics and (is_quoted or key not in intervals):
+            value = row.metrics[measure]
+            low, high = row.intervals.get(measure, (value, value))
+            reliable = not judged or row.details.get("reliable") is True
+            intervals[key] = Interval(name, value, low, high, reliable)
+    return list(intervals.values()), level
+
+
+_VERDICT, _BEHAVIOR = "verdict", "behavior"
+"""Detail and policy of rows of `ucfrec ope`."""
+_IMPLIED = ("steps", "choice")
+"""Conditions that follow from others."""
 _ORIGIN = ("config_hash", "data_fingerprint")
 _IDENTITY = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint")
 """Fields that a frame leaves out; a file of the rows has them."""
@@ -293,36 +364,35 @@ class ResultTable:
 
         lines = []
         for row in self.rows:
-            intervals = {row.metric: row.interval, **row.details.get("intervals", {})}
             line: dict[str, Any] = {"method": row.method}
             for name, value in row.metrics.items():
                 line[name] = value
-                if ends := intervals.get(name):
-                    line[f"{name}_low"], line[f"{name}_high"] = ends
+                if name in row.intervals:
+                    line[f"{name}_low"], line[f"{name}_high"] = row.intervals[name]
             lines.append({**line, **row.as_line(), **line})
         frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY), errors="ignore")
         return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Draw a metric of every method, by default that of the rows, with its 95% interval.
+        """Draw the picture of `report`: a metric of every method, by default that of the rows, with
+        its 95% interval; of `ope`, the estimate that the verdict is of and the logged return.
 
         Raises:
             InputError: no row has the metric.
         """
         from matplotlib import pyplot
 
-        metric, names = metric or self.rows[0].metric, self._list_metrics()
-        if metric not in names:
-            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(names)}")
-        frame = self.to_frame().dropna(subset=metric).iloc[::-1]
+        from ucfrec.results.charts import draw_intervals
+
+        name, names = metric or self.rows[0].metric, self._list_metrics()
+        if name not in names:
+            raise InputError(f"no row has the metric {name!r}; they have {', '.join(names)}")
         axes = pyplot.subplots()[1] if ax is None else ax
-        values = frame[metric]
-        low = frame.get(f"{metric}_low", values).fillna(values)
-        high = frame.get(f"{metric}_high", values).fillna(values)
-        errors = [values - low, high - values]
-        axes.errorbar(values, range(len(frame)), xerr=errors, fmt="o", capsize=3)
-        axes.set_yticks(range(len(frame)), frame["method"].tolist())
-        axes.set_xlabel(f"{metric}, with 95% intervals")
+        intervals, level = select_intervals(self.rows, metric)
+        height = draw_intervals(axes, intervals, level)
+        if ax is None:
+            axes.figure.set_size_inches(6, height / 72)  # type: ignore[union-attr]
+        axes.set_xlabel(name)
         return axes
 
     def save(self, file: Path | str) -> None:
@@ -346,13 +416,8 @@ class Evaluation(ResultTable):
     """Returns in a simulator, one row per policy."""
 
     headings = (
-        "R_cum",
-        "R_cum_low",
-        "R_cum_high",
-        "R_avg_pooled",
-        "length",
-        "coverage",
-        "diversity",
+        *("R_cum", "R_cum_low", "R_cum_high", "R_avg_pooled", "length"),
+        *("coverage", "diversity"),
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.reporting.charts import save
+from ucfrec.results.charts import save
 from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN

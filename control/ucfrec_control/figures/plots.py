@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ucfrec.arrays import Float64Array
-from ucfrec.reporting.charts import COLUMN, OURS, PAGE, PLAIN, file_style
+from ucfrec.results.charts import COLUMN, OURS, PAGE, PLAIN, file_style
 from ucfrec.results.statistics import summary
 
 Row = Mapping[str, Any]

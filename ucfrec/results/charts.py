@@ -13,11 +13,8 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 from ucfrec.errors import one_line
 from ucfrec.files.atomic import atomic_file
@@ -28,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 360, 220
-"""Size of line charts and histograms in SVG units, which are points in matplotlib; charts of
+"""Size of line charts in SVG units, which are points in matplotlib; charts of
 intervals have the same width. A phone is about as wide, so that text is not scaled there."""
 _VARIABLES = ("ink", "soft", "rule", "paper", *(f"c{series}" for series in range(8)))
 # Colors that matplotlib writes into the SVG, where variables take their places.
@@ -58,11 +55,12 @@ _STYLE: Final[Any] = {
     "figure.facecolor": "none",
     "axes.facecolor": "none",
     "lines.linewidth": 2,
+    "axes.prop_cycle": f"cycler(color={SERIES})",
 }
-_NAME, _BAR, _BOTTOM = 16, 28, 26
-"""Heights of a line of a name, of the bar below it with a gap, and of the axis below all."""
-_NAME_CHARACTERS = 48
-_MOST_LABELS = 6
+_LINE, _BAR, _BOTTOM = 16, 28, 26
+"""Heights of a line of a label, of the bar below it with a gap, and of the axis below all."""
+_LABEL_CHARACTERS = 48
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
@@ -77,19 +75,25 @@ class Chart:
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with its 95% interval."""
+    """A value with its 95% interval, whose ends are the value where it is not known."""
 
     name: str
     value: float
     low: float
     high: float
-    reliable: bool | None = None
-    """Whether a verdict lets the value stand; None where there is no verdict."""
+    reliable: bool = True
+    """Whether the value can be relied on; otherwise no number of it is drawn or said."""
+
+    @property
+    def numbers(self) -> str:
+        """The value with the interval in brackets."""
+        if not self.reliable:
+            return "the data cannot say"
+        ends = f" [{self.low:.4g}, {self.high:.4g}]" if self.low < self.high else ""
+        return f"{self.value:.4g}{ends}"
 
     def __str__(self) -> str:
-        verdicts = {True: ", the estimate stands", False: ", do not rely on it", None: ""}
-        ends = f"95% interval {self.low:.4g} to {self.high:.4g}"
-        return f"{self.name}: {self.value:.4g}, {ends}{verdicts[self.reliable]}"
+        return f"{self.name}: {self.numbers}"
 
 
 @contextmanager
@@ -108,16 +112,19 @@ def line_chart(
     title: str,
     x_label: str,
     curves: Sequence[tuple[str, int, Mapping[float, float]]],
-    levels: Mapping[str, float] | None = None,
 ) -> Chart:
     """Draw curves in one chart.
 
     Args:
         curves: (name, style, {x: y}) of each; at least one point, y finite. A run has the same
             style, which is its color and dashes, in all charts.
-        levels: name to a finite reference value, drawn as a horizontal line; at most two.
     """
-    figure, axes = _plot_axes(x_label)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
+    axes = figure.add_subplot()
+    axes.set_xlabel(one_line(x_label), loc="right")
+    axes.grid(axis="y")
     summaries = []
     for name, style, curve in curves:
         x, y = zip(*sorted(curve.items()), strict=True)
@@ -128,104 +135,76 @@ def line_chart(
             f"{name}: {y[0]:.4g} at {x[0]:g}, {y[-1]:.4g} at {x[-1]:g}, lowest {min(y):.4g} at "
             f"{x[y.index(min(y))]:g}"
         )
-    ordered = sorted((levels or {}).items(), key=lambda level: -level[1])
-    for (name, value), side in zip(ordered, ("bottom", "top"), strict=False):
-        axes.axhline(value, color=INK, linestyle="dotted", linewidth=1)
-        place, text = axes.get_yaxis_transform(), f"{name}: {value:.4g}"
-        axes.text(1, value, one_line(text), transform=place, ha="right", va=side)
-        summaries.append(f"For comparison, {text}")
     for axis in (axes.xaxis, axes.yaxis):
         _format_labels(axis)
     return render(figure, title, ". ".join(summaries))
 
 
 @page_style()
-def histogram(
-    title: str,
-    x_label: str,
-    counts: Sequence[float],
-    names: Sequence[str],
+def interval_chart(
+    title: str, intervals: Sequence[Interval], level: tuple[str, float] | None = None
 ) -> Chart:
-    """Draw counts (N,) of N named bins as columns of equal width, whatever the bins' widths."""
-    figure, axes = _plot_axes(x_label)
-    axes.bar(range(len(counts)), counts, width=0.95, color=SERIES[0], alpha=0.55)
-    labels = {}
-    for number in range(0, len(counts), -(-len(counts) // _MOST_LABELS)):
-        # The label of a range is at its lower edge, that of a value below the middle of its column.
-        low, end, _ = names[number].partition(" to ")
-        labels[number - 0.5 if end else number] = low
-    axes.set_xticks(list(labels), list(labels.values()))
-    _format_labels(axes.yaxis)
-    most = int(np.argmax(counts))
-    highest = f"{names[most]}: {counts[most]:,.6g}"
-    summary = f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is {highest}"
-    return render(figure, title, summary)
-
-
-def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> list[str]:
-    """Names of the bins of a histogram, by their edges (N + 1,) or by the counted values (N,)."""
-    if edges is not None:
-        return [f"{_short(low)} to <{_short(high)}" for low, high in pairwise(edges)]
-    return [_short(value) for value in values or ()]
-
-
-@page_style()
-def interval_chart(title: str, intervals: Sequence[Interval], logged: float | None = None) -> Chart:
-    """Draw values with their intervals one below the other, that of logged sessions as a line.
-
-    Values without a verdict are bars from 0; others are dots, hollow and dashed where the verdict
-    forbids to rely on them.
-    """
+    """Draw values with their intervals one below the other, and a level to compare them with."""
     from matplotlib.figure import Figure
 
-    names = [textwrap.fill(one_line(interval.name), _NAME_CHARACTERS) for interval in intervals]
-    slot = _NAME * max((name.count("\n") + 1 for name in names), default=1) + _BAR
-    count, bars = max(len(names), 1), any(interval.reliable is None for interval in intervals)
-    figure = Figure(figsize=(WIDTH / 72, (slot * count + _BOTTOM) / 72))
-    axes = figure.add_subplot(ylim=(count, 0), yticks=[])
-    axes.spines["left"].set(visible=bars, position=("data", 0))
-    axes.grid(axis="x")
-    place = axes.get_yaxis_transform()
-    for top, (name, interval) in enumerate(zip(names, intervals, strict=True)):
-        middle, dashes = top + 1 - 19 / slot, "dashed" if interval.reliable is False else "solid"
-        above = middle - 10 / slot
-        axes.text(0.01, above, name, transform=place, va="bottom", size=12, in_layout=False)
-        if bars:
-            axes.barh(middle, interval.value, 16 / slot, color=SERIES[0], alpha=0.55)
-        else:
-            fill = SERIES[0] if interval.reliable else PAPER
-            axes.plot(interval.value, middle, "o", color=SERIES[0], markerfacecolor=fill, zorder=3)
-        axes.plot((interval.low, interval.high), (middle, middle), "|", color=INK, markersize=8)
-        axes.hlines(middle, interval.low, interval.high, color=INK, linewidth=1, linestyle=dashes)
+    figure = Figure()
+    height = draw_intervals(figure.add_subplot(), intervals, level)
+    figure.set_size_inches(WIDTH / 72, height / 72)
     summaries = list(map(str, intervals))
-    if logged is not None:
-        summaries.append(f"For comparison, logged sessions: {logged:.4g}")
-        axes.axvline(logged, color=INK, linestyle="dotted", linewidth=1)
-    _format_labels(axes.xaxis)
+    if level is not None:
+        summaries.append(f"For comparison, {level[0]}: {level[1]:.4g}")
     return render(figure, title, ". ".join(summaries))
 
 
-def _plot_axes(x_label: str) -> "tuple[Figure, Axes]":
-    from matplotlib.figure import Figure
+def draw_intervals(
+    axes: "Axes", intervals: Sequence[Interval], level: tuple[str, float] | None = None
+) -> float:
+    """Draw what `interval_chart` does into axes, in the colors of matplotlib's settings; returns
+    the height in points that suits it."""
+    from matplotlib import rcParams
 
-    figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
-    axes = figure.add_subplot()
-    axes.set_xlabel(one_line(x_label), loc="right")
-    axes.grid(axis="y")
-    return figure, axes
+    # Numbers have spaces that do not break.
+    texts = [f"{one_line(i.name)}: {i.numbers.replace(' ', _NO_BREAK)}" for i in intervals]
+    labels = [textwrap.fill(text, _LABEL_CHARACTERS) for text in texts]
+    slot = _LINE * max((label.count("\n") + 1 for label in labels), default=1) + _BAR
+    top = _LINE / slot if level else 0.0
+    axes.set(ylim=(max(len(labels), 1), -top), yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.grid(axis="x")
+    place, soft = axes.get_yaxis_transform(), rcParams["xtick.color"]
+    for number, (label, interval) in enumerate(zip(labels, intervals, strict=True)):
+        middle, color = number + 1 - 19 / slot, rcParams["text.color"]
+        if interval.reliable:
+            axes.hlines(middle, interval.low, interval.high, color=color, linewidth=1)
+            axes.plot((interval.low, interval.high), (middle, middle), "|", color=color)
+            axes.plot(interval.value, middle, "o", color="C0", zorder=3)
+        else:
+            color = soft
+            axes.axhspan(middle - 8 / slot, middle + 8 / slot, facecolor=rcParams["grid.color"])
+        above = middle - 10 / slot
+        axes.text(
+            0.01, above, label, transform=place, color=color, va="bottom", size=12, in_layout=False
+        )
+    if level is not None:
+        axes.axvline(level[1], color=soft, linestyle="dotted", linewidth=1)
+        axes.margins(x=0.1)
+        left, right = axes.get_xlim()
+        side = "left" if 2 * level[1] < left + right else "right"
+        text = f" {level[0]}: {level[1]:.4g} "
+        axes.text(level[1], -top, one_line(text), color=soft, ha=side, va="top", in_layout=False)
+    elif not any(interval.reliable for interval in intervals):
+        axes.set_xticks([])
+    _format_labels(axes.xaxis)
+    return slot * max(len(labels), 1) + top * slot + _BOTTOM
 
 
 def _format_labels(axis: "Axis") -> None:
     """At most five labels, in thousands or millions where they are large."""
+    from matplotlib.ticker import EngFormatter
+
     axis.get_major_locator().set_params(nbins=5)  # type: ignore[call-arg]
     if max(map(abs, axis.get_view_interval())) >= 10_000:
-        axis.set_major_formatter(lambda value, _: _short(value))
-
-
-def _short(value: float) -> str:
-    if abs(value) >= 10_000:
-        return f"{value / 1e6:.4g}M" if abs(value) >= 1e6 else f"{value / 1e3:.4g}k"
-    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"
+        axis.set_major_formatter(EngFormatter(sep=""))
 
 
 def render(figure: "Figure", title: str, summary: str) -> Chart:

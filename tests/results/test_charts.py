@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 from tests.support.report_page import HOSTILE
-from ucfrec.reporting.charts import (
+from ucfrec.results.charts import (
     Chart,
     Interval,
-    histogram,
     interval_chart,
     line_chart,
-    name_bins,
     save,
 )
 
@@ -26,10 +24,9 @@ VALUES = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: round(x, 4))
 
 def charts_of(name: str) -> list[Chart]:
     return [
-        line_chart("t", name[:20], [(name, 9, {1.0: 2.0, 20_000.0: 3.5})], {name: 2.5, "b": 2.5}),
+        line_chart("t", name[:20], [(name, 9, {1.0: 2.0, 20_000.0: 3.5})]),
         interval_chart("t", [Interval(name, 1.0, 2.0, 3.0), Interval("b", -1.0, -2.0, 0.5)]),
-        interval_chart("t", [Interval(name, 1.0, 0.0, 3.0, False)], logged=0.5),
-        histogram("t", name[:20], [3, 0, 1], name_bins([0, 1, 2, 4], None)),
+        interval_chart("t", [Interval(name, 1.25, 0.0, 3.0, False)], (name, 0.5)),
     ]
 
 
@@ -50,24 +47,25 @@ def test_names_are_text_and_the_same_chart_gives_the_same_bytes(name: str) -> No
 
 
 def test_the_text_says_what_is_drawn() -> None:
-    line, bars, forest, columns = charts_of("ucf")
-    assert "ucf: 2 at 1, 3.5 at 20000, lowest 2 at 1. For comparison, ucf: 2.5" in line.summary
+    line, rules, grey = charts_of("ucf")
+    assert line.summary == "ucf: 2 at 1, 3.5 at 20000, lowest 2 at 1"
     assert "20k" in "".join(ElementTree.fromstring(line.svg).itertext())
-    assert "ucf: 1, 95% interval 2 to 3. b: -1, 95% interval -2 to 0.5" in bars.summary
-    assert forest.summary.endswith("do not rely on it. For comparison, logged sessions: 0.5")
-    assert "stroke-dasharray" in forest.svg
-    assert columns.summary == "3 columns from 0 to <1 to 2 to <4; the highest is 0 to <1: 3"
-    assert 'role="img" aria-label="t. ucf' in bars.svg
+    assert rules.summary == "ucf: 1 [2, 3]. b: -1 [-2, 0.5]"
+    assert 'role="img" aria-label="t. ucf' in rules.svg
+    # Of a value that cannot be relied on, no number is drawn or said.
+    assert grey.summary == "ucf: the data cannot say. For comparison, ucf: 0.5"
+    assert "1.25" not in grey.svg
+    assert "fill: var(--rule)" in grey.svg
+    assert "var(--c0)" not in grey.svg
     assert interval_chart("t", []).summary == ""
 
 
 @settings(max_examples=6, deadline=None)
 @given(st.dictionaries(st.integers(1, 10**7).map(float), VALUES, min_size=1, max_size=9))
-def test_any_curve_and_any_counts_are_drawn(curve: dict[float, float]) -> None:
+def test_any_curve_and_any_intervals_are_drawn(curve: dict[float, float]) -> None:
     assert "<path" in line_chart("t", "x", [("run", 0, curve)]).svg
-    counts = [abs(value) for value in curve.values()]
-    values = name_bins(None, list(curve))
-    assert f"{max(counts):,.6g}" in histogram("t", "x", counts, values).summary
+    intervals = [Interval(f"{name:g}", y, y - 1, y + 1) for name, y in curve.items()]
+    assert interval_chart("t", intervals).svg.count("<text") >= len(curve)
 
 
 @pytest.mark.parametrize("name", ["scores-../../outside", "returns-hopper/mine-v0", "a\\b\n:c"])

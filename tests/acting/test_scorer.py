@@ -270,8 +270,8 @@ def test_played_scored_ranked_and_recommended_alike(
     pd.concat([log, more]).to_parquet(tmp_path / "log.parquet")
     with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
         store, ranker = logged.store, PolicyRanker(trained, given)
-        (batch,) = score_steps(trained, store, given)
         later = Later(store, UserRows.of(store, np.array(logged.users), None))
+        (batch,) = score_steps(trained, store, later.rows, given)
         ends = np.flatnonzero(np.append(np.diff(batch.episodes) > 0, True))
         for user, found in expected.items():
             last = max(end for end in ends if logged.users[batch.episodes[end]] == user)

@@ -52,7 +52,7 @@ def test_context_holds_the_return_left(trained: TrainedPolicy, logged: LoggedSes
     seen = []
     for target in (3.0, 5.0):
         rule = DecisionRule(target, temperature=1.0)
-        batch = next(score_steps(trained, logged.store, rule))
+        batch = next(score_steps(trained, logged.store, logged.rows, rule))
         seen.append(make_inputs(trained, batch)[2])
         earned = torch.zeros(len(batch.steps))
         for row, (episode, step) in enumerate(zip(batch.episodes, batch.steps, strict=True)):
@@ -68,7 +68,9 @@ def test_context_holds_the_return_left(trained: TrainedPolicy, logged: LoggedSes
 
 def test_scores_of_the_item_and_of_all(trained: TrainedPolicy, logged: LoggedSessions) -> None:
     """Of an unknown item, the mean; what is all but impossible counts as e^−20."""
-    batch = next(score_steps(trained, logged.store, DecisionRule(3.0, temperature=1.0)))
+    batch = next(
+        score_steps(trained, logged.store, logged.rows, DecisionRule(3.0, temperature=1.0))
+    )
     items = batch.items.clone()
     items[1] = -1
     batch = replace(batch, items=items, scores=batch.scores.clone())

@@ -19,7 +19,7 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.record import CARD
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.off_policy.evaluate import EstimateOptions, collect_steps, evaluate_off_policy
+from ucfrec.off_policy.evaluate import collect_steps, evaluate_off_policy
 from ucfrec.off_policy.models import make_inputs
 from ucfrec.off_policy.score import (
     LoggedSessions,
@@ -89,7 +89,7 @@ def test_nothing_later_is_looked_at(log: pd.DataFrame, trained: TrainedPolicy, r
     for rows in (log, changed):
         with read(rows) as logged:
             _, steps = logged.store.all_steps()
-            batches = score_steps(trained, logged.store, RULE)
+            batches = score_steps(trained, logged.store, logged.rows, RULE)
             thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
     np.testing.assert_allclose(*thought, rtol=1e-4, atol=1e-5)
 
@@ -112,7 +112,7 @@ def test_models_see_the_policy(
 
 
 def test_features_are_means_over_items(trained: TrainedPolicy, logged: LoggedSessions) -> None:
-    batch = next(score_steps(trained, logged.store, RULE))
+    batch = next(score_steps(trained, logged.store, logged.rows, RULE))
     at_policy = make_inputs(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
@@ -202,15 +202,15 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
         batches = histories_of_frame(trained, before, LogMapping())
         found = pd.concat(recommend(trained, batches, 1, rule=rule, new_session=new_session))
         last = before.groupby("user_id").timestamp.max()
-        rows = found[["user_id", "item_id", "propensity"]].assign(reward=0.0)
+        rows = found[["user_id", "item_id", "propensity"]].assign(reward=0.0, excludes_seen=True)
         served.append(rows.assign(timestamp=rows.user_id.map(last) + pause))
         before = pd.concat([before, served[-1]])
     log = pd.concat(served).sort_values(["user_id", "timestamp"])
+    with read(log.drop(columns="excludes_seen")) as logged:
+        whole = pd.concat(score(trained, logged, rule))
     with read(log) as logged:
-        whole, filtered = (
-            pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
-        )
-        steps = collect_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True))[0]
+        filtered = pd.concat(score(trained, logged, rule))
+        steps = collect_steps(trained, logged, rule, 0)[0]
     np.testing.assert_allclose(filtered.probability, log.propensity, rtol=1e-4)
     np.testing.assert_allclose(steps.target, log.propensity, rtol=1e-4)
     assert (whole.probability < 0.99 * log.propensity.to_numpy()).any()

@@ -30,13 +30,15 @@ from ucfrec.updating.verdict import (
 LOGGED_ITEMS = 12
 
 
-def logged(folder: Path, items: Array, propensity: Any, split: tuple[float, ...]) -> EpisodeStore:
+def logged(
+    folder: Path, items: Array, propensity: Any, split: tuple[float, ...], **columns: Any
+) -> EpisodeStore:
     """Five rows of each user, in which low items are liked."""
     rows, chance = np.arange(len(items)), np.random.default_rng(1).random(len(items))
     log = pd.DataFrame({"user_id": rows // 5, "item_id": items, "propensity": propensity})
     log["timestamp"] = 1_700_000_000_000 + rows * 1000
     log["reward"] = (chance < 0.8 - 0.06 * items) * 1.0
-    return store_of(log, folder, split=split)
+    return store_of(log.assign(**columns), folder, split=split)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +56,10 @@ def rows_of_test(trained: TrainedPolicy) -> EpisodeStore:
     return EpisodeStore.open(trained.folder.parent / "store").split("test")
 
 
+def newest(rows: EpisodeStore) -> UserRows:
+    return UserRows.of(rows, rows.episode_values("user"), None)
+
+
 def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
     """A run that shows the items which are liked least."""
     policy = TrainedPolicy.load(trained.folder).policy
@@ -66,14 +72,14 @@ def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
 def test_a_better_and_a_worse_run_are_told_apart(trained: TrainedPolicy) -> None:
     bad = reversed_of(trained)
     for new, old, result, sign in ((trained, bad, "better", 1), (bad, trained, "worse", -1)):
-        found = compare_runs(new, old, rows_of_test(trained), 0)
+        found = compare_runs(new, old, newest(rows_of_test(trained)), 0)
         assert (found.result, found.decided_by) == (result, "reward per step")
         assert all(each.sign == sign for each in found.differences)
         assert describe(found).count("for" if sign > 0 else "against") >= 2
 
 
 def test_a_run_is_level_with_itself(trained: TrainedPolicy) -> None:
-    found = compare_runs(trained, trained, rows_of_test(trained), 0)
+    found = compare_runs(trained, trained, newest(rows_of_test(trained)), 0)
     assert found.result == "no significant difference"
     assert all(each.value == 0 for each in found.differences)
 
@@ -89,7 +95,7 @@ def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
 
 
 def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
-    found = compare_runs(trained, reversed_of(trained), rows_of(trained, None), 0)
+    found = compare_runs(trained, reversed_of(trained), newest(rows_of(trained, None)), 0)
     assert (found.result, found.decided_by) == ("better", "ndcg_liked")
     assert len(found.differences) == 1
 
@@ -97,7 +103,7 @@ def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> Non
 def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
     steps = rows_of_test(trained).n_steps
     wrong = rows_of(trained, np.full(steps, 5 / LOGGED_ITEMS, dtype=np.float32))
-    found = compare_runs(trained, trained, wrong, 0)
+    found = compare_runs(trained, trained, newest(wrong), 0)
     assert (found.result, found.decided_by) == ("no significant difference", "reward per step")
     assert "where 1 is expected" in found.differences[-1].doubt
     assert "not reliable" in describe(found)
@@ -109,11 +115,14 @@ def test_seen_items_are_compared_as_they_were_served(
     rng, users = np.random.default_rng(0), 400
     items = np.concatenate([rng.permutation(LOGGED_ITEMS)[:5] for _ in range(users)])
     propensity = 1 / (LOGGED_ITEMS - np.tile(np.arange(5), users))
-    store = logged(tmp_path, items, propensity, (0.2, 0.2, 0.6))
-    rows, others = store.split("test"), store.split("train")
+    newest = []
+    for name, columns in (("unsaid", {}), ("seen", {"excludes_seen": True})):
+        (tmp_path / name).mkdir()
+        store = logged(tmp_path / name, items, propensity, (0.2, 0.2, 0.6), **columns)
+        rows = store.split("test")
+        newest.append(UserRows.of(rows, rows.episode_values("user"), store.split("train")))
     uniform = replace(trained, rule=DecisionRule(trained.rule.target, temperature=1e6))
-    seen = UserRows.of(rows, rows.episode_values("user"), others)
-    wrong, right = (compare_runs(uniform, uniform, rows, 0, each) for each in (None, seen))
+    wrong, right = (compare_runs(uniform, uniform, each, 0) for each in newest)
     assert "update with --filter-seen" in describe(wrong)
     assert "mean weight" not in describe(right)
 
@@ -122,7 +131,7 @@ def test_a_difference_among_few_users_is_doubted(trained: TrainedPolicy) -> None
     rows = rows_of_test(trained)
     users = rows.episode_values("user")
     few = rows.select(np.flatnonzero(users < np.unique(users)[9]))
-    found = compare_runs(trained, reversed_of(trained), few, 0)
+    found = compare_runs(trained, reversed_of(trained), newest(few), 0)
     assert (found.result, found.users) == ("no significant difference", 9)
     assert all("fewer than 10, have such rows" in each.doubt for each in found.differences)
 

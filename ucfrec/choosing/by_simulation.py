@@ -97,6 +97,9 @@ class _ManyRules(PolicyActor):
         self._rule = np.repeat(np.arange(len(scorers)), n)
         self._lists, self._chances = torch.zeros(2, 0, 0)
         self._place, self._length = 0, length
+        if length > 1:
+            # As `recommend` and `serve` do unless they are told to keep what was seen.
+            self._shown = torch.zeros(rows, self._n_items, dtype=torch.bool)
 
     def keep(self, rows: IntArray) -> None:
         super().keep(rows)
@@ -151,7 +154,8 @@ class _ManyRules(PolicyActor):
             items, chances = rule.choose(scores, generator)
             return items.unsqueeze(1), chances.unsqueeze(1)
         draws = torch.rand(len(scores), self._n_items + 1, generator=generator)
-        return rule.rank_items(scores, min(self._length, self._n_items), draws)
+        items, chances = rule.rank_items(scores, min(self._length, self._n_items), draws)
+        return items, chances.float()
 
 
 def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:

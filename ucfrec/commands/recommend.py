@@ -61,7 +61,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             )
         from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.recommending.histories import histories_of_files
-        from ucfrec.recommending.recommend import ItemIndex, recommend
+        from ucfrec.recommending.recommend import ItemIndex, decide
 
         if (master := self.find_spark()) is None:
             require_table_names([self.out, self.exposures])
@@ -106,11 +106,11 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
                     bar.update(len(batch.users))
 
             candidates = self._read_candidates(trained)
-            frames = recommend(
+            decisions = decide(
                 trained, count_users(), self.k, candidates=candidates, index=index, **how
             )
             if self.exposures is None:
-                rows = write_frames(self.out, frames)
+                rows = write_frames(self.out, (frame for frame, _ in decisions))
             else:
                 from ucfrec.recommending.exposures import exposures_written
 
@@ -118,7 +118,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
                     self.exposures,
                     trained,
                     rule.hash,
-                    frames,
+                    decisions,
                     excludes_seen=not self.keep_seen,
                     at=self.at,
                 ) as written:

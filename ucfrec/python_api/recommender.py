@@ -41,7 +41,8 @@ from ucfrec.python_api.given_data import (
 )
 from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
-from ucfrec.recommending.recommend import recommend, similar_items
+from ucfrec.recommending.exposures import exposures_written
+from ucfrec.recommending.recommend import decide, similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
@@ -251,8 +252,9 @@ class Recommender:
         rule: DecisionRule | None = None,
         seed: int = 0,
         mapping: Columns | None = None,
+        exposures: Path | str | None = None,
     ) -> pd.DataFrame:
-        """The `k` best next items of every user; nothing is written to disk.
+        """The `k` best next items of every user.
 
         Rows are read as by `ucfrec prepare`, which drops rows with a warning, and sessions are
         split as those of training. Rows that repeat a user, item and time count once. The state is
@@ -276,6 +278,8 @@ class Recommender:
                 the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
                 training log if `histories` has them, and otherwise as above.
+            exposures: Parquet file for what is shown, with its probabilities, for `join_feedback`;
+                None for none.
 
         Returns:
             `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at temperature 1 among
@@ -284,7 +288,7 @@ class Recommender:
             sorted order; fewer rows if fewer items remain, as with less than k candidates.
         """
         trained = self.trained
-        frames = recommend(
+        decisions = decide(
             trained,
             read_histories(trained, histories, mapping, users),
             k,
@@ -296,7 +300,19 @@ class Recommender:
             new_session=new_session,
             at=at,
         )
-        with use_words_of_python():
+        with ExitStack() as stack, use_words_of_python():
+            frames: Iterable[pd.DataFrame] = (frame for frame, _ in decisions)
+            if exposures is not None:
+                hashed = (rule or trained.rule).hash
+                written = exposures_written(
+                    Path(exposures),
+                    trained,
+                    hashed,
+                    decisions,
+                    excludes_seen=filter_seen,
+                    at=at,
+                )
+                frames = stack.enter_context(written)
             return pd.concat(frames, ignore_index=True)
 
     @_checked

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
@@ -57,12 +58,12 @@ def exposures_written(
     path: Path,
     trained: TrainedPolicy,
     rule: str,
-    frames: Iterable[pd.DataFrame],
+    decisions: Iterable[tuple[pd.DataFrame, IntArray]],
     *,
     excludes_seen: bool,
     at: str | float | None = None,
 ) -> Iterator[Iterator[pd.DataFrame]]:
-    """Yield the same frames of `recommend`, also written to a file, whole once the block ends.
+    """Yield the frames of `decide`, also written to a file, whole once the block ends.
 
     Requests are a millisecond apart, from the time `at` on, or from now, so that a split by time
     can part them.
@@ -77,10 +78,9 @@ def exposures_written(
 
     def write_all() -> Iterator[pd.DataFrame]:
         first = begin
-        for frame in frames:
+        for frame, began in decisions:
             exposures = frame.rename(columns={RANK: schema.POSITION}).assign(**constants)
             times = first + exposures[schema.USER_ID].factorize()[0]
-            began = frame.attrs[schema.SESSION_BEGAN]
             exposures[schema.TIMESTAMP] = times
             exposures[schema.SESSION_BEGAN] = np.where(began < 0, times, began)
             first = int(times.max(initial=first - 1)) + 1

@@ -51,6 +51,16 @@ def recommend(
     trained: TrainedPolicy,
     batches: Iterable[Histories],
     k: int,
+    **how: Any,
+) -> Iterator[pd.DataFrame]:
+    """The frames of `decide`, which takes the same arguments."""
+    return (frame for frame, _ in decide(trained, batches, k, **how))
+
+
+def decide(
+    trained: TrainedPolicy,
+    batches: Iterable[Histories],
+    k: int,
     *,
     rule: DecisionRule | None = None,
     filter_seen: bool = True,
@@ -60,7 +70,7 @@ def recommend(
     at: str | float | None = None,
     seed: int = 0,
     index: "ItemIndex | None" = None,
-) -> Iterator[pd.DataFrame]:
+) -> Iterator[tuple[pd.DataFrame, IntArray]]:
     """`k` next items of every user, by the decision rule.
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
@@ -90,7 +100,8 @@ def recommend(
         temperature 1 among the items that are left, nats; with an index, less that of the user's
         best item), `propensity` (probability of the item at its position, given those before it),
         `request_id` (the same for all items of a user); k rows per user, in the order shown, fewer
-        if fewer items remain.
+        if fewer items remain. Beside it, for each row, when the user's session began, ms; −1 for
+        now.
 
     Raises:
         InputError: an argument is wrong, the policy's actions are vectors, or an item of the logs
@@ -106,7 +117,7 @@ def recommend(
         excluded[torch.from_numpy(allowed)] = False
     _require_available(trained, chooser.request_times(1), excluded)
 
-    def to_frame(batch: Histories) -> pd.DataFrame:
+    def to_frame(batch: Histories) -> tuple[pd.DataFrame, IntArray]:
         histories = batch.with_numbers(trained.items, filter_seen)
         if not (skip_unknown or (histories.item_ids >= 0).all()):
             raise _refuse_unknown(trained.items, [batch, *remaining])
@@ -117,18 +128,18 @@ def recommend(
         new = np.full(len(histories.users), new_session)
         items, scores, propensities, began = chooser.choose(histories, requests, k, new, excluded)
         left = np.isfinite(scores)
+        counts = left.sum(1)
         frame = pd.DataFrame(
             {
-                schema.USER_ID: np.repeat(histories.users, left.sum(1)),
+                schema.USER_ID: np.repeat(histories.users, counts),
                 RANK: np.cumsum(left, axis=1)[left],
                 schema.ITEM_ID: trained.items.ids[items[left]],
                 SCORE: scores[left],
                 schema.PROPENSITY: propensities[left],
-                schema.REQUEST_ID: np.repeat(requests, left.sum(1)),
+                schema.REQUEST_ID: np.repeat(requests, counts),
             }
         )
-        frame.attrs[schema.SESSION_BEGAN] = np.repeat(began, left.sum(1))
-        return frame
+        return frame, np.repeat(began, counts)
 
     return map(to_frame, remaining)
 

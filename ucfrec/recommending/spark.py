@@ -1,10 +1,12 @@
 """Recommend next items to the users of a log with Apache Spark, for users of any number."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import LONGEST_HISTORY
@@ -15,7 +17,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import session_by
-from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.recommend import decide
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy
 
@@ -50,7 +52,7 @@ def recommend_with_spark(
     Raises:
         InputError: an argument or the logs cannot be used, or Spark is missing or fails.
     """
-    recommended: Any = partial(recommend, k=k, rule=rule or trained.rule, **how)
+    recommended: Any = partial(decide, k=k, rule=rule or trained.rule, **how)
     recommended(trained, ())  # checks the arguments
     columns = columns_used(trained, mapping)
     log = UserLog(files, columns, reward_of(trained), session_by(trained))
@@ -78,7 +80,8 @@ def _recommend_part(
     histories = read_histories(
         [rows], mapping, "reward", LONGEST_HISTORY, memory_limit, by, duplicates
     )
-    frames = recommended(trained, histories)
+    decisions = recommended(trained, histories)
+    frames: Iterator[pd.DataFrame] = (frame for frame, _ in decisions)
     with ExitStack() as stack:
         for path in exposures:
             how = recommended.keywords
@@ -86,7 +89,7 @@ def _recommend_part(
                 path,
                 trained,
                 how["rule"].hash,
-                frames,
+                decisions,
                 excludes_seen=how["filter_seen"],
                 at=how["at"],
             )

@@ -155,6 +155,22 @@ def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: 
     assert chisquare(counts.numpy(), n * (stated / stated.sum()).numpy()).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("rule", [*RANDOM, DecisionRule(0.0)], ids=str)
+def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(rule: DecisionRule) -> None:
+    generator = torch.Generator().manual_seed(3)
+    scores = torch.randn(300, 7, generator=generator)
+    scores[torch.rand(300, 7, generator=generator) < 0.2] = -math.inf
+    items, propensities = rule.rank_items(scores, 4, draws(scores, generator))
+    for place in range(5):
+        earlier = torch.nn.functional.pad(items[:, :place], (0, 1), value=-1)
+        chances = rule.log_probabilities(scores, earlier).double().exp()
+        torch.testing.assert_close(chances.sum(1), torch.ones(300).double(), atol=1e-5, rtol=0)
+        assert not chances.gather(1, items[:, :place]).any()
+        if place < 4:
+            of_items = chances.gather(1, items[:, place : place + 1])[:, 0]
+            torch.testing.assert_close(of_items, propensities[:, place], atol=1e-6, rtol=1e-5)
+
+
 def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:
     scores = torch.tensor([[0.0, 40.0, 1.0]])
     rule = DecisionRule(0.0, temperature=1.0)

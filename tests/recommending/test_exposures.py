@@ -26,7 +26,10 @@ def answers(trained: TrainedPolicy) -> dict[int, Answer]:
 
 def rows_of(given: dict[int, Answer]) -> list[tuple[object, ...]]:
     return [
-        (str(user), item, answer.request_id, position, propensity, answer.run, answer.rule)
+        (
+            *(str(user), item, answer.request_id, position, propensity),
+            *(answer.session_began, answer.excludes_seen, answer.run, answer.rule),
+        )
         for user, answer in given.items()
         for position, (item, propensity) in enumerate(
             zip(answer.items, answer.propensities, strict=True), 1

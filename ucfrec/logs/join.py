@@ -42,6 +42,8 @@ _OTHERS = {
 }
 """Columns of exposures besides the keys, and their DuckDB types."""
 _EXPOSURE = (*_KEYS, *_OTHERS)
+_ABSENT = {schema.ARM: "''", schema.SESSION_BEGAN: "NULL::BIGINT", schema.EXCLUDES_SEEN: "false"}
+"""Columns that exposures may lack, and SQL of what they then are."""
 _MEASURED = (schema.TIMESTAMP, schema.PROPENSITY)
 """Columns that may differ where an exposure is written twice."""
 _ONE_EXPOSURE = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
@@ -161,7 +163,7 @@ def _holds_feedback(kind: str) -> bool:
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]) -> _Further:
     """Create the table `exposures`, each once, with its `row`; returns its further columns."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in {*_names_of(table), schema.ARM}]
+        missing = [name for name in _EXPOSURE if name not in {*_names_of(table), *_ABSENT}]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
@@ -189,7 +191,7 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
 
 def _select_others(table: Table, keys: Table, further: _Further) -> str:
     """SQL of the columns of exposures besides the `keys` that a table has, and of its rows."""
-    names, values, texts = _names_of(table), {schema.ARM: "''"}, []
+    names, values, texts = _names_of(table), dict(_ABSENT), []
     more = {key: f"more_{n}" for n, key in enumerate(further) if key in names}
     for name, kind in _OTHERS.items():
         if name in names and kind == "VARCHAR":

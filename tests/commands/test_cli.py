@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 from tests.support.markdown import ROOT
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
-from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
+from ucfrec.commands.cli import UCFREC, explanation, main, parse_command
 from ucfrec.commands.train import settings_text
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
@@ -113,12 +113,12 @@ def test_help_fits_one_screen(
 )
 def test_options_stand_anywhere(line: str) -> None:
     words = line.split()
-    options = vars(build_parser(UCFREC, words).parse_args(words))
+    options = vars(parse_command(UCFREC, words)[1])
     named = [options.get("run"), *options.get("runs", []), *options.get("logs", [])]
     assert [str(one) for one in named if one is not None] == ["run", "logs"]
     assert "F" in map(str, options.values()) or options.get("k") == 3 or options["env"] == "E"
     with pytest.raises(SystemExit):
-        build_parser(UCFREC, words).parse_args([*words, "--no-such-option"])
+        parse_command(UCFREC, [*words, "--no-such-option"])
 
 
 @pytest.fixture(scope="module")
@@ -272,8 +272,7 @@ def test_a_command_does_what_the_python_api_does(
         files = [path for path in Path().rglob("*") if path.is_file() and STORE not in str(path)]
         written.append({str(path): _content(path) for path in files if "tfevents" not in path.name})
     for hint in re.findall(r"(?:next: | {6})(ucfrec .*?)(?:, |$)", printed[0], re.MULTILINE):
-        words = shlex.split(hint)[1:]
-        build_parser(UCFREC, words).parse_args(words)
+        parse_command(UCFREC, shlex.split(hint)[1:])
     assert written[0].keys() == written[1].keys()
     for name, content in written[0].items():
         if isinstance(content, pd.DataFrame):

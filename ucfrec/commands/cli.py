@@ -13,7 +13,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import import_module, metadata
 from typing import Any
 
@@ -107,12 +107,10 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     name = program.name
     try:
         with interruptions_raised(), notes_on_one_line(program.name):
-            options = build_parser(program, arguments).parse_args(arguments)
-            name = f"{program.name} {options.command}"
-            table = program.find_table(options.command)
+            command, options = parse_command(program, arguments)
+            name = f"{program.name} {command}"
             with local_paths(options) as options:
-                values = {field.name: getattr(options, field.name) for field in fields(table)}  # type: ignore[arg-type]
-                table(**values).execute()
+                program.find_table(command)(**vars(options)).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -181,12 +179,7 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         warnings.simplefilter("always", InputNote)
         show_other = warnings.showwarning
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            *where: Any,
-            **how: Any,
-        ) -> None:
+        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
             if issubclass(category, InputNote):
                 print(one_line(f"{name}: note: {message}"), file=sys.stderr)
             else:
@@ -196,10 +189,10 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         yield
 
 
-def build_parser(program: Program, arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """Parser of all commands, with the options of only the command that `arguments` name.
+def parse_command(program: Program, arguments: Sequence[str]) -> tuple[str, argparse.Namespace]:
+    """The called command and its options, which may stand before, between and after runs and logs.
 
-    Options of the other commands would need their modules, whose imports take seconds.
+    Only its module is imported: those of all commands take seconds.
     """
     lines = [program.summary]
     for name, summary in program.commands.items():
@@ -214,17 +207,17 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
     )
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND", parser_class=_CommandParser
+    parser.add_argument("command", metavar="COMMAND", choices=[*program.commands])
+    parser.add_argument("words", metavar="…", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    called = parser.parse_args(arguments)
+    command = argparse.ArgumentParser(
+        prog=f"{program.name} {called.command}",
+        description=program.commands[called.command],
+        formatter_class=_Formatter,
+        add_help=False,
     )
-    called = next((word for word in arguments if word in program.commands), None)
-    how: dict[str, Any] = {"formatter_class": _Formatter, "add_help": False}
-    for name, summary in program.commands.items():
-        how |= {"description": summary, "prog": f"{program.name} {name}"}
-        command = commands.add_parser(name, **how)
-        if name == called:
-            add_options(command, program.find_table(name), arguments)
-    return parser
+    add_options(command, program.find_table(called.command), called.words)
+    return called.command, command.parse_intermixed_args(called.words)
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -232,26 +225,6 @@ class _Formatter(argparse.HelpFormatter):
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(text, width, break_on_hyphens=False)
-
-
-class _CommandParser(argparse.ArgumentParser):
-    """Options before, between and after runs and logs (`ope RUN --json FILE LOGS`).
-
-    A plain parser gives all that a list of files may take to its first words, and does not know
-    those after an option.
-    """
-
-    _intermixed = False
-
-    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
-        # It calls this method: once for the options, once for the rest.
-        if self._intermixed:
-            return super().parse_known_args(args, namespace)
-        self._intermixed = True
-        try:
-            return self.parse_known_intermixed_args(args, namespace)
-        finally:
-            self._intermixed = False
 
 
 if __name__ == "__main__":

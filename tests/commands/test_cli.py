@@ -384,14 +384,15 @@ def test_model_card(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
     environment = ["--env", "synthetic-catalog", "--episodes", "20"]
     assert main(["evaluate", run, *environment]) == 0
     assert main(["ope", run, logs, "--temperature", "1"]) == 0
-    for rule in ([], ["--temperature", "3", "--target-return", "2"]):
+    for rule in ([], ["--temperature", "3", "--target", "q0.5"]):
         assert main(["rank", run, logs, "--k", "5", *rule]) == 0
     found = card.read_text()
     assert "### ucfrec evaluate: synthetic-catalog, target " in found
     assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
     assert "- Do not rely on this estimate: " in found
     own = TrainedPolicy.load(Path(run)).rule
-    for rule in (own, replace(own, temperature=3.0, target=2.0)):
+    median = TrainedPolicy.load(Path(run)).target_return(0.5)
+    for rule in (own, replace(own, temperature=3.0, target=median)):
         assert f"### ucfrec rank: sessions.parquet, {rule}, k 5, checkpoint best" in found
     assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
     assert str(tmp_path) not in found
@@ -417,6 +418,7 @@ def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> No
     for more, says in (
         ([run, "--targets", "5,much"], "--targets: 'much' is not a number"),
         ([run, "--temperatures", "1,hot"], "is not a number; write e.g. 0,0.5,1"),
+        ([run, "--target", "much"], "--target much is no number; write e.g. 5, q0.9 or max"),
         ([], "name a run folder"),
     ):
         assert says in refused(["ope", *more, str(logs)], capsys)

@@ -44,7 +44,7 @@ PHRASES = {
     r"\bthe (logs|log) (tell|say|know)s?\b": "the log shows, supports",
 }
 """Pattern to what to write instead."""
-SAYING = {"InputError", "InputNote", "SettingError", "print", "_say", "warn"}
+SAYING = {"InputError", "InputNote", "SettingError", "print", "warn"}
 """Functions and errors whose texts users read."""
 MOST = {"SECURITY.md": 0, "README.md": 0, "CONTRIBUTING.md": 0}
 """Hits that a text may have; `MOST_HITS` for others."""

@@ -33,17 +33,10 @@ class Program:
     package: str
     """Package with the modules of the commands, each a `Table` called as the command."""
     commands: Mapping[str, str]
-    """Command name to its one-line summary in `--help`."""
+    """Command name to its one-line summary in `--help`, after the module and a colon if that has
+    another name."""
     sections: Mapping[str, str] = field(default_factory=dict)
     """First command of each section of `--help` to the title of the section."""
-    modules: Mapping[str, str] = field(default_factory=dict)
-    """Command name to its module, if that has another name."""
-
-    def find_table(self, command: str) -> type[Table]:
-        """The table of a command."""
-        module = import_module(f"{self.package}.{self.modules.get(command, command)}")
-        table: type[Table] = getattr(module, command.capitalize())
-        return table
 
 
 UCFREC = Program(
@@ -53,37 +46,29 @@ UCFREC = Program(
     {
         "prepare": "turn logs into an episode store",
         "train": "train a policy on an episode store; resumes",
-        "rank": "measure how well policies rank items shown and clicked later",
+        "rank": "ope: measure how well policies rank items shown and clicked later",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
         "recommend": "recommend the next items to the users of a log",
-        "serve": "answer requests for recommendations over HTTP",
-        "report": "write one HTML page about training runs",
-        "join": "join exposures with their feedback into a log",
-        "update": "train on from a run with new logs, and compare both; resumes",
-        "compare": "compare two runs that shared the traffic (A/B test)",
-        "promote": "make a run the one that `serve RUNS` uses",
+        "serve": "recommend: answer requests for recommendations over HTTP",
+        "report": "runs: write one HTML page about training runs",
+        "join": "runs: join exposures with their feedback into a log",
+        "update": "runs: train on from a run with new logs, and compare both; resumes",
+        "compare": "runs: compare two runs that shared the traffic (A/B test)",
+        "promote": "runs: make a run the one that `serve RUNS` uses",
         "demo": "run every step on simulated logs and write a report; resumes",
-        "settings": "list every training setting: default, range, meaning",
-        "tune": "search the settings of a training; resumes",
-        "evaluate": "measure the return of policies in a simulator",
-        "score": "write a policy's probability of every logged choice",
-        "explore": "try out one or two policies in the browser",
-        "export": "write the policy with its rule as an ONNX graph",
-        "verify": "compare every file of stores and runs with its checksum",
-        "datasets": "list public data sets, or download one",
-        "collect": "simulate sessions and write them as Parquet logs",
-        "screen": "find logged observation columns that have no effect",
+        "settings": "train: list every training setting, its default, range and meaning",
+        "tune": "train: search the settings of a training; resumes",
+        "evaluate": "benchmark: measure the return of policies in a simulator",
+        "score": "ope: write a policy's probability of every logged choice",
+        "explore": "recommend: try out one or two policies in the browser",
+        "export": "recommend: write the policy with its rule as an ONNX graph",
+        "verify": "runs: compare every file of stores and runs with its checksum",
+        "datasets": "prepare: list public data sets, or download one",
+        "collect": "benchmark: simulate sessions and write them as Parquet logs",
+        "screen": "train: find logged observation columns that have no effect",
         "benchmark": "measure every method and print tables; resumes",
     },
     {"prepare": "from logs to recommendations", "join": "every day", "demo": "advanced"},
-    {
-        **dict.fromkeys(("report", "promote", "verify"), "runs"),
-        **dict.fromkeys(("join", "compare"), "update"),
-        **dict.fromkeys(("settings", "tune", "screen"), "train"),
-        **dict.fromkeys(("evaluate", "collect"), "simulate"),
-        **dict.fromkeys(("rank", "score"), "ope"),
-        **{"explore": "serve", "export": "recommend", "datasets": "prepare"},
-    },
 )
 
 
@@ -107,10 +92,10 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     name = program.name
     try:
         with interruptions_raised(), notes_on_one_line(program.name):
-            command, options = parse_command(program, arguments)
-            name = f"{program.name} {command}"
+            table, options = parse_command(program, arguments)
+            name = f"{program.name} {table.__name__.lower()}"
             with local_paths(options) as options:
-                program.find_table(command)(**vars(options)).execute()
+                table(**vars(options)).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -189,15 +174,16 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         yield
 
 
-def parse_command(program: Program, arguments: Sequence[str]) -> tuple[str, argparse.Namespace]:
-    """The called command and its options, which may stand before, between and after runs and logs.
-
-    Only its module is imported: those of all commands take seconds.
+def parse_command(
+    program: Program, arguments: Sequence[str]
+) -> tuple[type[Table], argparse.Namespace]:
+    """The table of the called command and its options, which may stand before, between and after
+    runs and logs. Only its module is imported: those of all commands take seconds.
     """
     lines = [program.summary]
     for name, summary in program.commands.items():
         lines += [f"\n{program.sections[name]}:"] if name in program.sections else []
-        lines.append(f"  {name:<12}{summary}")
+        lines.append(f"  {name:<12}{summary.rpartition(': ')[2]}")
     parser = argparse.ArgumentParser(
         prog=program.name,
         description="\n".join(lines),
@@ -210,14 +196,17 @@ def parse_command(program: Program, arguments: Sequence[str]) -> tuple[str, argp
     parser.add_argument("command", metavar="COMMAND", choices=[*program.commands])
     parser.add_argument("words", metavar="…", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     called = parser.parse_args(arguments)
+    module, _, summary = program.commands[called.command].rpartition(": ")
     command = argparse.ArgumentParser(
         prog=f"{program.name} {called.command}",
-        description=program.commands[called.command],
+        description=summary,
         formatter_class=_Formatter,
         add_help=False,
     )
-    add_options(command, program.find_table(called.command), called.words)
-    return called.command, command.parse_intermixed_args(called.words)
+    package = import_module(f"{program.package}.{module or called.command}")
+    table: type[Table] = getattr(package, called.command.capitalize())
+    add_options(command, table, called.words)
+    return table, command.parse_intermixed_args(called.words)
 
 
 class _Formatter(argparse.HelpFormatter):

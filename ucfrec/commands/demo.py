@@ -32,14 +32,10 @@ class DemoConfig:
     episodes: int = 500
     """Evaluated episodes of each policy."""
     settings: Sequence[str] = (
-        "policy.dim=32",
-        "policy.context=11",
-        "train.steps=300",
-        "train.learning_rate=2e-3",
-        "crm.epochs=4",
-        "rule.sessions=50",
-        "rule.evidence=0",
+        *("policy.dim=32", "policy.context=11", "train.steps=300", "train.learning_rate=2e-3"),
+        *("crm.epochs=4", "rule.sessions=50", "rule.evidence=0"),
     )
+    """Of all methods."""
     methods: Sequence[str] = ("ucf", SHARED, "dt")
     """Names of the recommendation benchmark's methods; the longest training first."""
 
@@ -48,10 +44,7 @@ FULL = DemoConfig(
     sessions=6000,
     episodes=1000,
     settings=(
-        "policy.dim=64",
-        "policy.context=11",
-        "train.steps=1500",
-        "train.learning_rate=1e-3",
+        *("policy.dim=64", "policy.context=11", "train.steps=1500", "train.learning_rate=1e-3"),
         "crm.epochs=8",
     ),
     methods=("ucf", "ucf-wo-count", SHARED, "dt", "sasrec"),
@@ -87,7 +80,8 @@ class Demo(Table):
         print(f"\n{evaluation_table(rows)}\n")
         print("What this shows (return: sum of the rewards of a session; [95% interval]):")
         for environment in ENVIRONMENTS:
-            print(conclusion(environment, {r.method: r for r in rows if r.task == environment}))
+            by_method = {row.method: row for row in rows if row.task == environment}
+            print(conclusion(environment, by_method))
         print(f"Report with all curves and tables: {out / 'report.html'}")
         print("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
@@ -98,12 +92,10 @@ def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
         method: f"{row.value:.3g} [{row['R_cum_low']:.3g}, {row['R_cum_high']:.3g}]"
         for method, row in rows.items()
     }
-    shared = "there are no shared components, as actions are vectors"
     if SHARED in rows:
-        shared = (
-            f"with the shared components, which UCF has too and any method can use, DT has\n"
-            f"  {values[SHARED]} (exposure features, reward weight, selected decision rule)"
-        )
+        shared = f"with the shared components, which any method can use, DT has {values[SHARED]}"
+    else:
+        shared = "there are no shared components, as actions are vectors"
     return (
         f"- {environment}: logged sessions have {values['mixture']}, random actions "
         f"{values['random']}, the best\n  possible ones {values['optimal']}. From the log alone, "

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 from tests.support.markdown import ROOT
 from ucfrec import Recommender
 from ucfrec.acting.rollout import rollout
-from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
+from ucfrec.commands.cli import UCFREC, explanation, main, parse_command
 from ucfrec.commands.train import settings_text
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
@@ -111,12 +111,12 @@ def test_help_fits_one_screen(
 )
 def test_options_stand_anywhere(line: str) -> None:
     words = line.split()
-    options = vars(build_parser(UCFREC, words).parse_args(words))
+    options = vars(parse_command(UCFREC, words)[1])
     named = [options.get("run"), *options.get("runs", []), *options.get("logs", [])]
     assert [str(one) for one in named if one is not None] == ["run", "logs"]
     assert "F" in map(str, options.values()) or options.get("k") == 3 or options["env"] == "E"
     with pytest.raises(SystemExit):
-        build_parser(UCFREC, words).parse_args([*words, "--no-such-option"])
+        parse_command(UCFREC, [*words, "--no-such-option"])
 
 
 @pytest.fixture(scope="module")
@@ -264,8 +264,7 @@ def test_a_command_does_what_the_python_api_does(
         files = [path for path in Path().rglob("*") if path.is_file() and STORE not in str(path)]
         written.append({str(path): _content(path) for path in files if "tfevents" not in path.name})
     for hint in re.findall(r"(?:next: | {6})(ucfrec .*?)(?:, |$)", printed[0], re.MULTILINE):
-        words = shlex.split(hint)[1:]
-        build_parser(UCFREC, words).parse_args(words)
+        parse_command(UCFREC, shlex.split(hint)[1:])
     assert written[0].keys() == written[1].keys()
     for name, content in written[0].items():
         if isinstance(content, pd.DataFrame):
@@ -377,14 +376,15 @@ def test_model_card(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
     environment = ["--env", "synthetic-catalog", "--episodes", "20"]
     assert main(["evaluate", run, *environment]) == 0
     assert main(["ope", run, logs, "--temperature", "1"]) == 0
-    for rule in ([], ["--temperature", "3", "--target-return", "2"]):
+    for rule in ([], ["--temperature", "3", "--target", "q0.5"]):
         assert main(["rank", run, logs, "--k", "5", *rule]) == 0
     found = card.read_text()
     assert "### ucfrec evaluate: synthetic-catalog, target " in found
     assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
     assert "- Do not rely on this estimate: " in found
     own = TrainedPolicy.load(Path(run)).rule
-    for rule in (own, replace(own, temperature=3.0, target=2.0)):
+    median = TrainedPolicy.load(Path(run)).target_return(0.5)
+    for rule in (own, replace(own, temperature=3.0, target=median)):
         assert f"### ucfrec rank: sessions.parquet, {rule}, k 5, checkpoint best" in found
     assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
     assert str(tmp_path) not in found
@@ -410,6 +410,7 @@ def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> No
     for more, says in (
         ([run, "--targets", "5,much"], "--targets: 'much' is not a number"),
         ([run, "--temperatures", "1,hot"], "is not a number; write e.g. 0,0.5,1"),
+        ([run, "--target", "much"], "--target much is no number; write e.g. 5, q0.9 or max"),
         ([], "name a run folder"),
     ):
         assert says in refused(["ope", *more, str(logs)], capsys)

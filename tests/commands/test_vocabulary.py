@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.markdown import PROGRAMS, ROOT
-from ucfrec.commands.cli import Program, build_parser
+from ucfrec.commands.cli import Program, parse_command
 
 PHRASES = {
     r"\btilt(s|ed|ing)?\b": "reward weight",
@@ -44,7 +44,7 @@ PHRASES = {
     r"\bthe (logs|log) (tell|say|know)s?\b": "the log shows, supports",
 }
 """Pattern to what to write instead."""
-SAYING = {"InputError", "InputNote", "SettingError", "print", "_say", "warn"}
+SAYING = {"InputError", "InputNote", "SettingError", "print", "warn"}
 """Functions and errors whose texts users read."""
 MOST = {"SECURITY.md": 0, "README.md": 0, "CONTRIBUTING.md": 0}
 """Hits that a text may have; `MOST_HITS` for others."""
@@ -99,7 +99,7 @@ def _line(text: str, at: int) -> str:
 )
 def test_help_uses_them(program: Program, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        build_parser(program, [command]).parse_args([command, "--help-all"])
+        parse_command(program, [command, "--help-all"])
     assert _hits(" ".join(capsys.readouterr().out.split())) == []
 
 

@@ -183,8 +183,9 @@ def test_the_command_recommends_candidates_only(
     write(pd.DataFrame({"item_id": [4, 8, 999]}), tmp_path / name)
     command = ["recommend", str(run), str(run.parent / "log.parquet"), "--keep-seen"]
     command += ["--out", str(tmp_path / "out.parquet"), "--candidates", str(tmp_path / name)]
-    assert main(command) == 0
-    assert "does not know 1 of 3 items" in capsys.readouterr().err
+    assert main(command) == 2
+    assert "1 of 3 named items" in capsys.readouterr().err
+    assert main([*command, "--skip-unknown"]) == 0
     found = pd.read_parquet(tmp_path / "out.parquet")
     log = pd.read_parquet(run.parent / "log.parquet")
     expected = policy.recommend(log, k=10, candidates=[4, 8], filter_seen=False)

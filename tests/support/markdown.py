@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ucfrec.commands.cli import UCFREC, Program, build_parser
+from ucfrec.commands.cli import UCFREC, Program, parse_command
 from ucfrec_control.cli import CONTROL
 
 ROOT = Path(__file__).parents[2]
@@ -53,7 +53,7 @@ def parse(command: str) -> argparse.Namespace:
     """Read a command line as the program would; exits if it would refuse it."""
     name, *words = shlex.split(command)
     program: Program = PROGRAMS[name]
-    return build_parser(program, words).parse_args(words)
+    return parse_command(program, words)[1]
 
 
 def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.benchmark.cells import Budget, Cell, Measurement, Method
 from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.benchmark.tables import note_updates
 from ucfrec.errors import InputError
@@ -48,8 +48,8 @@ class Benchmark:
     budgets: Mapping[str, Budget]
     tasks: Collection[str]
     """Names that `BenchmarkRequest.tasks` may have."""
-    methods: Collection[str]
-    """Names that `BenchmarkRequest.methods` may have."""
+    methods: Mapping[str, Method]
+    """By name, which `BenchmarkRequest.methods` may have."""
     plan: Callable[["BenchmarkRequest", Budget], Cells]
     how: Measurement
 

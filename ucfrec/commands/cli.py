@@ -13,7 +13,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import import_module, metadata
 from typing import Any
 
@@ -33,17 +33,10 @@ class Program:
     package: str
     """Package with the modules of the commands, each a `Table` called as the command."""
     commands: Mapping[str, str]
-    """Command name to its one-line summary in `--help`."""
+    """Command name to its one-line summary in `--help`, after the module and a colon if that has
+    another name."""
     sections: Mapping[str, str] = field(default_factory=dict)
     """First command of each section of `--help` to the title of the section."""
-    modules: Mapping[str, str] = field(default_factory=dict)
-    """Command name to its module, if that has another name."""
-
-    def find_table(self, command: str) -> type[Table]:
-        """The table of a command."""
-        module = import_module(f"{self.package}.{self.modules.get(command, command)}")
-        table: type[Table] = getattr(module, command.capitalize())
-        return table
 
 
 UCFREC = Program(
@@ -53,36 +46,28 @@ UCFREC = Program(
     {
         "prepare": "turn logs into an episode store",
         "train": "train a policy on an episode store; resumes",
-        "rank": "measure how well policies rank items shown and clicked later",
+        "rank": "ope: measure how well policies rank items shown and clicked later",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
         "recommend": "recommend the next items to the users of a log",
-        "serve": "answer requests for recommendations over HTTP",
-        "report": "write one HTML page about training runs",
-        "join": "join exposures with their feedback into a log",
-        "update": "train on from a run with new logs, and compare both; resumes",
-        "compare": "compare two runs that shared the traffic (A/B test)",
-        "promote": "make a run the one that `serve RUNS` uses",
+        "serve": "recommend: answer requests for recommendations over HTTP",
+        "report": "runs: write one HTML page about training runs",
+        "join": "runs: join exposures with their feedback into a log",
+        "update": "runs: train on from a run with new logs, and compare both; resumes",
+        "compare": "runs: compare two runs that shared the traffic (A/B test)",
+        "promote": "runs: make a run the one that `serve RUNS` uses",
         "demo": "run every step on simulated logs and write a report; resumes",
-        "settings": "list every training setting: default, range, meaning",
-        "tune": "search the settings of a training; resumes",
-        "evaluate": "measure the return of policies in a simulator",
-        "score": "write a policy's probability of every logged choice",
-        "explore": "try out one or two policies in the browser",
-        "export": "write the policy with its rule as an ONNX graph",
-        "verify": "compare every file of stores and runs with its checksum",
-        "datasets": "list public data sets, or download one",
-        "collect": "simulate sessions and write them as Parquet logs",
+        "settings": "train: list every training setting, its default, range and meaning",
+        "tune": "train: search the settings of a training; resumes",
+        "evaluate": "benchmark: measure the return of policies in a simulator",
+        "score": "ope: write a policy's probability of every logged choice",
+        "explore": "recommend: try out one or two policies in the browser",
+        "export": "recommend: write the policy with its rule as an ONNX graph",
+        "verify": "runs: compare every file of stores and runs with its checksum",
+        "datasets": "prepare: list public data sets, or download one",
+        "collect": "benchmark: simulate sessions and write them as Parquet logs",
         "benchmark": "measure every method and print tables; resumes",
     },
     {"prepare": "from logs to recommendations", "join": "every day", "demo": "advanced"},
-    {
-        **dict.fromkeys(("report", "promote", "verify"), "runs"),
-        **dict.fromkeys(("join", "compare"), "update"),
-        **dict.fromkeys(("settings", "tune"), "train"),
-        **dict.fromkeys(("evaluate", "collect"), "simulate"),
-        **dict.fromkeys(("rank", "score"), "ope"),
-        **{"explore": "serve", "export": "recommend", "datasets": "prepare"},
-    },
 )
 
 
@@ -106,12 +91,10 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     name = program.name
     try:
         with interruptions_raised(), notes_on_one_line(program.name):
-            options = build_parser(program, arguments).parse_args(arguments)
-            name = f"{program.name} {options.command}"
-            table = program.find_table(options.command)
+            table, options = parse_command(program, arguments)
+            name = f"{program.name} {table.__name__.lower()}"
             with local_paths(options) as options:
-                values = {field.name: getattr(options, field.name) for field in fields(table)}  # type: ignore[arg-type]
-                table(**values).execute()
+                table(**vars(options)).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -180,12 +163,7 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         warnings.simplefilter("always", InputNote)
         show_other = warnings.showwarning
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            *where: Any,
-            **how: Any,
-        ) -> None:
+        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
             if issubclass(category, InputNote):
                 print(one_line(f"{name}: note: {message}"), file=sys.stderr)
             else:
@@ -195,15 +173,16 @@ def notes_on_one_line(name: str) -> Iterator[None]:
         yield
 
 
-def build_parser(program: Program, arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """Parser of all commands, with the options of only the command that `arguments` name.
-
-    Options of the other commands would need their modules, whose imports take seconds.
+def parse_command(
+    program: Program, arguments: Sequence[str]
+) -> tuple[type[Table], argparse.Namespace]:
+    """The table of the called command and its options, which may stand before, between and after
+    runs and logs. Only its module is imported: those of all commands take seconds.
     """
     lines = [program.summary]
     for name, summary in program.commands.items():
         lines += [f"\n{program.sections[name]}:"] if name in program.sections else []
-        lines.append(f"  {name:<12}{summary}")
+        lines.append(f"  {name:<12}{summary.rpartition(': ')[2]}")
     parser = argparse.ArgumentParser(
         prog=program.name,
         description="\n".join(lines),
@@ -213,17 +192,20 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
     )
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND", parser_class=_CommandParser
+    parser.add_argument("command", metavar="COMMAND", choices=[*program.commands])
+    parser.add_argument("words", metavar="…", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    called = parser.parse_args(arguments)
+    module, _, summary = program.commands[called.command].rpartition(": ")
+    command = argparse.ArgumentParser(
+        prog=f"{program.name} {called.command}",
+        description=summary,
+        formatter_class=_Formatter,
+        add_help=False,
     )
-    called = next((word for word in arguments if word in program.commands), None)
-    how: dict[str, Any] = {"formatter_class": _Formatter, "add_help": False}
-    for name, summary in program.commands.items():
-        how |= {"description": summary, "prog": f"{program.name} {name}"}
-        command = commands.add_parser(name, **how)
-        if name == called:
-            add_options(command, program.find_table(name), arguments)
-    return parser
+    package = import_module(f"{program.package}.{module or called.command}")
+    table: type[Table] = getattr(package, called.command.capitalize())
+    add_options(command, table, called.words)
+    return table, command.parse_intermixed_args(called.words)
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -231,26 +213,6 @@ class _Formatter(argparse.HelpFormatter):
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(text, width, break_on_hyphens=False)
-
-
-class _CommandParser(argparse.ArgumentParser):
-    """Options before, between and after runs and logs (`ope RUN --json FILE LOGS`).
-
-    A plain parser gives all that a list of files may take to its first words, and does not know
-    those after an option.
-    """
-
-    _intermixed = False
-
-    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
-        # It calls this method: once for the options, once for the rest.
-        if self._intermixed:
-            return super().parse_known_args(args, namespace)
-        self._intermixed = True
-        try:
-            return self.parse_known_intermixed_args(args, namespace)
-        finally:
-            self._intermixed = False
 
 
 if __name__ == "__main__":

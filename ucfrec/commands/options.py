@@ -19,7 +19,6 @@ from typing import (
     Annotated,
     Any,
     ClassVar,
-    Final,
     Literal,
     Union,
     dataclass_transform,
@@ -30,15 +29,23 @@ from typing import (
 
 from ucfrec.files.remote import Input, Output, uri_or_path
 
-ARGUMENT: Final = object()
+ARGUMENT = object()
 """Marks a field as positional."""
-EXCLUSIVE: Final = object()
-"""Marks fields of a class of which a command line may have one."""
-POSITIVE: Final = range(1, 2**63)
-SEED: Final = range(2**32)
-INPUT: Final = uri_or_path(Input, str)
-INPUT_FOLDER: Final = uri_or_path(Input, Path)
-OUTPUT: Final = uri_or_path(Output, Path)
+INPUT = uri_or_path(Input, str)
+INPUT_FOLDER = uri_or_path(Input, Path)
+OUTPUT = uri_or_path(Output, Path)
+
+
+def read_number(limits: range, word: str) -> int:
+    """A whole number within limits, or argparse's error."""
+    if not word.isdecimal() or len(word) > 19 or int(word) not in limits:
+        most = f"to {limits.stop - 1}" if limits.stop < 2**63 else "on"
+        raise argparse.ArgumentTypeError(f"{word} is not a whole number from {limits.start} {most}")
+    return int(word)
+
+
+POSITIVE = partial(read_number, range(1, 2**63))
+SEED = partial(read_number, range(2**32))
 
 
 class Group(str):
@@ -57,8 +64,9 @@ class Names:
 class Table:
     """Options that a subclass declares as fields, with a default if they need not be given.
 
-    The type may be `Annotated` with what the help calls the value (one that ends in "…" takes
-    several words), a function that reads a word, the range of a number, and marks of this module.
+    The type may be `Annotated` with what the help calls the value (N of whole numbers, PATH of
+    paths, else the last word of the name), a function that reads a word, and marks of this module.
+    An option of a sequence is repeatable.
     """
 
     title: ClassVar[str | None] = None
@@ -87,11 +95,7 @@ class Table:
 def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[str, Any]:
     """The fields of a settings table that the command line names."""
     values = {field.name: getattr(options, prefix + field.name, None) for field in fields(table)}
-    return {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in values.items()
-        if value is not None and value is not False
-    }
+    return {name: value for name, value in values.items() if not (value is None or value is False)}
 
 
 def add_options(
@@ -105,7 +109,7 @@ def add_options(
     text = "show this help message and exit" if everything else argparse.SUPPRESS
     parser.add_argument("-h", "--help", action="help", help=text)
     parser.add_argument("--help-all", action="help", help="describe all options")
-    groups: dict[Any, Any] = {"": parser}
+    groups: dict[str, Any] = {"": parser}
     hidden: dict[str, list[str]] = {}
     usage, hints = ["%(prog)s"], get_type_hints(table, include_extras=True)
     for field in fields(table):  # type: ignore[arg-type]
@@ -118,10 +122,6 @@ def add_options(
         if title not in groups:
             groups[title] = parser.add_argument_group(title, (everything and more) or None)
         group = groups[title]
-        if EXCLUSIVE in marks:
-            if owner not in groups:
-                groups[owner] = group.add_mutually_exclusive_group()
-            group = groups[owner]
         name = f"--{field.name.replace('_', '-')}"
         if ARGUMENT in marks:
             name, group = field.name, parser
@@ -131,7 +131,7 @@ def add_options(
             if title and group is not parser:
                 hidden.setdefault(title, []).append(name)
                 text = argparse.SUPPRESS
-        action = group.add_argument(name, help=text, **_read_words(kind, marks, field.default))
+        action = group.add_argument(name, help=text, **_read_words(field, kind, marks))
         word = str(action.metavar or field.name.upper())
         if ARGUMENT in marks:
             word += "..." if action.nargs in ("+", "*") else ""
@@ -143,47 +143,38 @@ def add_options(
         short._group_actions += [
             argparse.Action([], title, help=", ".join(names)) for title, names in hidden.items()
         ]
-    parser.usage, parser.epilog = table.usage or " ".join([*usage, "[options]"]), table.epilog
+    parser.usage = table.usage or " ".join([*usage, "[options]"])
+    parser.epilog = table.epilog
 
 
-def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]:
+def _read_words(option: "Field[Any]", kind: Any, marks: Sequence[Any]) -> dict[str, Any]:
     """Arguments of `add_argument` for a field of some type."""
     if get_origin(kind) in (Union, UnionType):
         kind = get_args(kind)[0]  # the other one is None
-    positional, required, origin = ARGUMENT in marks, default is MISSING, get_origin(kind)
+    positional, default, origin = ARGUMENT in marks, option.default, get_origin(kind)
+    required = default is MISSING
     how: dict[str, Any] = {} if required else {"default": default}
     if kind is bool:
         return how | {"action": "store_true"}
     if origin is Literal:
         return how | {"choices": get_args(kind)}
-    metavar = next((mark for mark in marks if type(mark) is str), None)
+    last = option.name.rpartition("_")[2].upper()
+    name = last if positional else {int: "N", Path: "PATH"}.get(kind, last)
+    name = how["metavar"] = next((mark for mark in marks if type(mark) is str), name)
     if origin is tuple:
-        return how | {"type": float, "nargs": 2, "metavar": tuple(str(metavar).split())}
+        return how | {"type": float, "nargs": 2, "metavar": tuple(name.split())}
     if several := origin is Sequence:
         kind = get_args(kind)[0]
-        how = {} if required else {"default": [*default]}
-    if positional:
-        if several or not required:
-            how["nargs"] = "?" if not several else "+" if required else "*"
+        how["default"] = [] if default is MISSING else [*default]
+    if positional and (several or not required):
+        how["nargs"] = "?" if not several else "+" if required else "*"
     elif several:
-        takes_several = metavar is not None and metavar.endswith("…")
-        how |= {"action": "extend", "nargs": "+"} if takes_several else {"action": "append"}
-    elif required:
+        how["action"] = "append"
+    elif required and not positional:
         how["required"] = True
-    if metavar is not None:
-        how["metavar"] = metavar.removesuffix("…") if several else metavar
     if names := [mark.find() for mark in marks if isinstance(mark, Names) and mark.closed]:
         how["choices"] = names[0]
-    for limits in (mark for mark in marks if isinstance(mark, range)):
-        return how | {"type": partial(_read_number, limits)}
     return how | {"type": next((mark for mark in marks if callable(mark)), kind)}
-
-
-def _read_number(limits: range, word: str) -> int:
-    if not word.isdecimal() or len(word) > 19 or int(word) not in limits:
-        most = f"to {limits.stop - 1}" if limits.stop < POSITIVE.stop else "on"
-        raise argparse.ArgumentTypeError(f"{word} is not a whole number from {limits.start} {most}")
-    return int(word)
 
 
 def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> str:

@@ -21,9 +21,7 @@ class Prepare(LogOptions, SparkOption):
     """Scalar SQL expression over the log's columns, e.g. is_click (default: of the dataset or
     --mapping, else the column reward)"""
     session_by: Literal["gap", "user", "session_id"] | None = None
-    """Start a new session after a pause, once per user, or with a new session_id (default: of the
-    dataset or --mapping, else session_id if the log has it, else gap)"""
-    gap_minutes: Annotated[float | None, "MINUTES"] = None
+    gap_minutes: float | None = None
     split: Annotated[str | None, "TRAIN,VALIDATION,TEST"] = None
     """Shares of the rows in order of time; or two ISO times (UTC) at which validation and test
     begin (default: 0.8,0.1,0.1)"""
@@ -32,7 +30,7 @@ class Prepare(LogOptions, SparkOption):
     duplicates: Annotated[
         Literal["highest", "lowest", "first", "last"] | None, Group("reading logs")
     ] = None
-    max_session: Annotated[int | None, Group("reading logs"), "N"] = None
+    max_session: Annotated[int | None, Group("reading logs")] = None
     engine: Annotated[Literal["duckdb", "spark"], Group("engine")] = "duckdb"
 
     def execute(self) -> None:
@@ -50,7 +48,7 @@ class Prepare(LogOptions, SparkOption):
         options = {"dataset": "generic", **settings_given(self, PrepareOptions)}
         if self.reward is not None:
             options["reward"] = Expression(self.reward, "--reward")
-        if self.split is not None:
+        if self.split:
             options["split"] = parse_split(self.split)
         self.find_spark()  # refuses a master of another engine
         how = PrepareOptions(**options)
@@ -58,7 +56,7 @@ class Prepare(LogOptions, SparkOption):
             print(format_report(validate(files, mapping, how)))
             print("\nnothing was written; next: the same command with --out STORE, not --validate")
             return
-        if self.out is None:
+        if not self.out:
             raise InputError(
                 "no store is named; add --out STORE, or --validate to only check the logs"
             )
@@ -75,9 +73,9 @@ class Datasets(Table):
 
     epilog = "Downloads need ucfrec[datasets] (pooch). Mind the licence of each data set."
 
-    name: Annotated[str | None, ARGUMENT, "NAME"] = None
+    name: Annotated[str | None, ARGUMENT] = None
     """Data set to load (default: list them)"""
-    folder: Annotated[Path | None, "DIR"] = None
+    folder: Path | None = None
     """Where its archive lies or is downloaded to, and is unpacked."""
     part: str | None = None
     """Of open-bandit: logging policy and campaign (default: random/all)"""
@@ -94,7 +92,7 @@ class Datasets(Table):
                 datasets[name] = load_plugin("datasets", name)
             except InputError as error:
                 warn_user(str(error))
-        if self.name is None:
+        if not self.name:
             lines = [
                 (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)
                 for adapter, dataset in datasets.items()
@@ -104,7 +102,7 @@ class Datasets(Table):
             print("\nnext: ucfrec datasets NAME --folder DIR")
             return
         adapter = find_release(datasets, self.name)
-        if self.folder is None:
+        if not self.folder:
             raise InputError(f"no folder is named; add --folder DIR for the files of {self.name}")
         logs = load_release(adapter, datasets[adapter], self.name, self.folder, self.part)
         release = datasets[adapter].releases[self.name]

@@ -1,32 +1,26 @@
 """Options that several commands share, and the objects that they stand for."""
 
-import re
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Group, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, INPUT, Table, settings_given
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.evaluation.simulator import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.off_policy.score import LoggedSessions
-    from ucfrec.recommending.exposures import ExposureLog
-    from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
-
-_UNITS_MS = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
 
 
 class RunArgument(Table):
     """A run, named before logs."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
+    run: Annotated[Path, ARGUMENT]
     """Run folder of `ucfrec train`."""
 
 
@@ -34,26 +28,23 @@ class LogOptions(Table):
     """Logs, and how they are read."""
 
     title = "reading logs"
+    described_by = "ucfrec.logs.mapping:LogMapping"
 
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
+    logs: Annotated[Sequence[str], ARGUMENT, INPUT]
     """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
-    dataset: Annotated[str | None, "NAME"] = None
+    dataset: str | None = None
     """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, else generic)"""
     column: Annotated[Sequence[str], "NAME=COLUMN"] = ()
     """File column or SQL expression for a log column, e.g. user_id=uid; repeatable (default: as of
     the run, or the column of the same name)"""
-    mapping: Annotated[Path | None, "TOML"] = None
-    """File with column mapping, reward and feature tables; --column overrides it (default: none)"""
-    time_format: Annotated[str | None, "FORMAT"] = None
-    """How times are written that are text, e.g. '%d/%m/%Y %H:%M' (default: ISO 8601, and dates
-    whose order of day and month the file settles)"""
+    mapping: Path | None = None
+    """TOML file with column mapping, reward and feature tables; --column overrides it (default:
+    none)"""
+    time_format: str | None = None
     earliest: Annotated[str | None, "TIME"] = None
-    """ISO time before which times are clock errors (default: 2000-01-01)"""
     where: Annotated[str | None, "SQL"] = None
-    """Condition that rows must fulfil, e.g. "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
     partitions: bool = False
-    """Read names of folders such as country=DE as columns."""
-    memory_limit: Annotated[str, "SIZE"] = "2GB"
+    memory_limit: str = "2GB"
     """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to disk"""
 
     def find_logs(
@@ -79,9 +70,9 @@ class LogOptions(Table):
             where=self.where and Expression(self.where, "--where"),
             partitions=self.partitions,
         )
-        if self.mapping is not None:
+        if self.mapping:
             mapping = mapping.over(read_mapping(self.mapping))
-        if trained is not None and self.dataset is None:
+        if trained is not None and not self.dataset:
             from ucfrec.runs.later_logs import later_logs
 
             files, mapping = later_logs(trained, logs, mapping)
@@ -118,7 +109,7 @@ class SparkOption(Table):
     title = "engine"
     engine: str
 
-    spark_master: Annotated[str | None, "MASTER"] = None
+    spark_master: str | None = None
     """With --engine spark: its master, e.g. spark://HOST:7077, whose workers see all inputs and
     outputs (default: local[*], this machine)"""
 
@@ -142,24 +133,20 @@ class RuleOptions(Table):
 
     checkpoint: Literal["best", "last"] = "best"
     """Weights of the lowest validation loss or the last ones, for runs without a refit"""
-    target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
+    target: str | None = None
     """Target return, in units of the reward, of a session; of every step with a horizon or
-    discount"""
-    target_quantile: Annotated[float | None, EXCLUSIVE, "QUANTILE"] = None
-    """Target return: this quantile of the training's, 0 to 1; 1 is the largest"""
-    max_return: Annotated[bool, EXCLUSIVE] = False
-    """Target return: the largest that the policy expects in each state."""
-    minimum_target: Annotated[float | None, "TARGET"] = None
-    reward_weight: Annotated[float | None, "WEIGHT"] = None
-    policy_weight: Annotated[float | None, "WEIGHT"] = None
-    lookahead: Annotated[float | None, "LOOKAHEAD"] = None
-    temperature: Annotated[float | None, "TEMPERATURE"] = None
-    top_k: Annotated[int | None, "N"] = None
-    explore: Annotated[float | None, "EXPLORE"] = None
-    explore_top: Annotated[int | None, "N"] = None
+    discount; q0.9 for a quantile of the training's, max for the largest that the policy expects"""
+    minimum_target: float | None = None
+    reward_weight: float | None = None
+    policy_weight: float | None = None
+    lookahead: float | None = None
+    temperature: float | None = None
+    top_k: int | None = None
+    explore: float | None = None
+    explore_top: int | None = None
     exclude_seen: bool = False
-    tag_window: Annotated[int | None, "N"] = None
-    tag_run: Annotated[int | None, "N"] = None
+    tag_window: int | None = None
+    tag_run: int | None = None
 
     def load(self, run: Path, split: bool = False) -> "TrainedPolicy":
         """The policy of a run, with the weights that the command line names."""
@@ -178,83 +165,20 @@ class RuleOptions(Table):
         from ucfrec.acting.decision import DecisionRule
 
         parts = settings_given(self, DecisionRule)
-        if self.target_quantile is not None:
-            parts["target"] = trained.target_return(self.target_quantile)
-        elif self.target_return is not None or self.max_return:
-            parts["target"] = self.target_return
+        if self.target:
+            parts["target"] = read_target(self.target, trained)
         return replace(trained.rule, **parts)
 
 
-class AnswerOptions(RuleOptions):
-    """How requests are answered, and the largest that are."""
-
-    title = "answering"
-    described_by = "ucfrec.recommending.requests:Limits"
-    prefix = "max_"
-    engine: str
-
-    k: Annotated[int, Group("")] = 10
-    """Items for each user; if a request does not say how many."""
-    exposures: Annotated[Path | None, Group(""), "PATH"] = None
-    """Write what was shown, with its probability; a folder for requests; see docs/exposures.md"""
-    keep_seen: Annotated[bool, Group("")] = False
-    """Also recommend items that the user has seen; (default: leave them out)"""
-    skip_unknown: bool = False
-    """Ignore rows and candidates with items outside the run's catalogue (default: an error)"""
-    seed: int = 0
-    """Of the draws of a rule with --temperature or --explore."""
-    max_bytes: Annotated[int | None, "N"] = None
-    max_k: Annotated[int | None, "N"] = None
-    max_history: Annotated[int | None, "N"] = None
-    max_candidates: Annotated[int | None, "N"] = None
-
-    def make_responder(self, trained: "TrainedPolicy") -> "Responder":
-        """What answers requests."""
-        from ucfrec.recommending.requests import Limits
-        from ucfrec.recommending.responder import Responder
-
-        return Responder(
-            trained,
-            Limits(**settings_given(self, Limits, "max_")),
-            rule=self.make_rule(trained),
-            k=self.k,
-            filter_seen=not self.keep_seen,
-            skip_unknown=self.skip_unknown,
-            seed=self.seed,
-            engine=self.engine,
-        )
-
-    def open_exposures(
-        self, trained: "TrainedPolicy"
-    ) -> "AbstractContextManager[ExposureLog | None]":
-        """Where a server's answers are written; None for nowhere."""
-        from ucfrec.recommending.exposures import ExposureLog
-
-        if self.exposures is None:
-            return nullcontext()
-        return closing(ExposureLog(self.exposures, trained))
-
-
-class EnvironmentOptions(Table):
-    """The parts of an environment."""
-
-    title = "the environment"
-
-    env_folder: Annotated[Path | None, "FOLDER"] = None
-    """Folder with the simulator's files, e.g. its weights (default: none)"""
-    observe: Annotated[str, "KEY[,KEY…]"] = ""
-    """Of gymnasium:ID with a dict observation: entries that are observed, as one vector (default:
-    none, states come from the items shown and their rewards)"""
-    item_features: Annotated[str | None, "SOURCE"] = None
-    """Of gymnasium:ID with items: their features, from an attribute of the environment or a file
-    .npy (a row for each item) or .parquet (with a column item_id from 0) (default: none)"""
-
-    def make_environment(self, name: str) -> "Environment":
-        """The environment of that name with these parts."""
-        from ucfrec.evaluation.simulator import Environment
-
-        observe = tuple(key for key in self.observe.split(",") if key)
-        return Environment(name, self.env_folder, observe=observe, item_features=self.item_features)
+def read_target(text: str, trained: "TrainedPolicy") -> float | None:
+    """The target return that `--target` names; None for the largest that the policy expects."""
+    if text == "max":
+        return None
+    try:
+        value = float(text.removeprefix("q"))
+    except ValueError:
+        raise InputError(f"--target {text} is no number; write e.g. 5, q0.9 or max") from None
+    return trained.target_return(value) if text.startswith("q") else value
 
 
 def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
@@ -266,12 +190,3 @@ def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
     if not runs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     return runs, [word for word in words if Path(word) not in runs]
-
-
-def read_duration(option: str, text: str) -> int:
-    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`."""
-    match = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", text.strip())
-    milliseconds = 0 if match is None else round(float(match[1]) * _UNITS_MS[match[2]])
-    if not milliseconds:
-        raise InputError(f"{option} {text} is not a duration; write e.g. 90s, 30m, 12h or 60d")
-    return milliseconds

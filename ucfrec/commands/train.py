@@ -28,14 +28,14 @@ class TrainingOptions(Table):
 
     epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
 
-    store: Annotated[Path, ARGUMENT, INPUT_FOLDER, "STORE"]
+    store: Annotated[Path, ARGUMENT, INPUT_FOLDER]
     """Episode store to train on; also at s3://, gs://, hdfs://, …"""
     out: Annotated[Path, "RUN"]
     """Folder of the run; an unfinished run in it is resumed."""
-    policy: Annotated[str, "NAME", Names(policy_names)] = "ucf"
+    policy: Annotated[str, Names(policy_names)] = "ucf"
     """Policy."""
-    config: Annotated[Path | None, "TOML"] = None
-    """File of settings with one table per section (default: none)"""
+    config: Path | None = None
+    """TOML file of settings with one table per section (default: none)"""
     set: Annotated[Sequence[str], "TABLE.FIELD=VALUE"] = ()
     """One setting, e.g. train.steps=2000; overrides --config; repeatable (default: none)"""
     seed: int = 0
@@ -53,7 +53,7 @@ class Train(TrainingOptions):
     no_refit: bool = False
     """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
     `ope` on the test split use the weights before that)"""
-    evidence: Annotated[int | None, "N"] = None
+    evidence: int | None = None
     """Effective users that the decision rule must leave in the validation sessions; where the log
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""
 
@@ -68,7 +68,7 @@ class Train(TrainingOptions):
         from ucfrec.runs.config import resolve_config
         from ucfrec.runs.refit import refit
 
-        if self.threads is not None:
+        if self.threads:
             torch.set_num_threads(self.threads)
         with joined():
             if not leads():
@@ -119,26 +119,26 @@ class Tune(Table):
 
     epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
 
-    store: Annotated[Path, ARGUMENT, "STORE"]
+    store: Annotated[Path, ARGUMENT]
     """Episode store to train on."""
-    out: Annotated[Path, "DIR"]
+    out: Path
     """Folder of the search; an unfinished search in it is resumed."""
-    policy: Annotated[Sequence[str], "NAME", Names(policy_names)] = ()
+    policy: Annotated[Sequence[str], Names(policy_names)] = ()
     """Policy (default: ucf); repeatable to search the policy too; one of"""
-    trials: Annotated[int, "N"] = 30
+    trials: int = 30
     """Trainings that the search has at the end."""
     metric: Literal["value", "ndcg", "gauc"] = "value"
     """What is maximised: the return of a session in the user model, or NDCG or GAUC on validation
     rows"""
     k: Annotated[int, POSITIVE] = 10
     """Items recommended, of --metric ndcg."""
-    space: Annotated[Path | None, "TOML"] = None
-    """Settings to search, one table per section; each a list of choices or {low = …, high = …, log
-    = true} (default: learning rate, steps, width, dropout, context, exposure features and
-    augmentation of networks, neighbours of item-knn; with ndcg and gauc also the reward weight)"""
+    space: Path | None = None
+    """TOML file of settings to search, each a list of choices or {low = …, high = …, log = true}
+    (default: learning rate, steps, width, dropout, context, exposure features and augmentation of
+    networks, neighbours of item-knn; with ndcg and gauc also the reward weight)"""
     set: Annotated[Sequence[str], "TABLE.FIELD=VALUE"] = ()
     """A setting that all trials have, e.g. train.steps=2000; repeatable (default: none)"""
-    workers: Annotated[int, "N"] = 1
+    workers: int = 1
     """Trainings side by side, each in a process."""
     no_pruning: bool = False
     """Train every trial to its end; (default: end those whose validation loss is above the median
@@ -148,42 +148,23 @@ class Tune(Table):
 
     def execute(self) -> None:
         """Print the best settings."""
-        from ucfrec.reporting.tables import text_table
         from ucfrec.runs.config import settings_given
         from ucfrec.tuning.space import Search, read_space
-        from ucfrec.tuning.study import (
-            BEST,
-            BEST_TOML,
-            PAGE,
-            Plan,
-            importances,
-            list_finished,
-            tune,
-        )
+        from ucfrec.tuning.study import BEST, BEST_TOML, PAGE, Plan, tune
 
         search = Search(
             tuple(dict.fromkeys(self.policy or ["ucf"])),
             settings_given(self.set),
             self.metric == "value",
             self.seed,
-            None if self.space is None else read_space(self.space),
+            read_space(self.space) if self.space else None,
         )
         plan = Plan(self.store, self.out, search, self.metric, self.k, not self.no_pruning)
-        study = tune(plan, self.trials, self.workers)
-        best, weights = study.best_trial, importances(study)
-        lines = [
-            (
-                name,
-                f"{value:.4g}" if isinstance(value, float) else value,
-                f"{weights.get(name, 0):.2f}",
-            )
-            for name, value in best.params.items()
-        ]
-        print(text_table(("setting", "best", "importance"), lines))
+        tune(plan, self.trials, self.workers)
+        print((self.out / BEST_TOML).read_text(encoding="utf-8"))
         print(
-            f"\n{self.metric} {study.best_value:.6g} in trial {best.number}, of "
-            f"{len(list_finished(study))} trials; selected on validation rows\n"
-            f"settings: {self.out / BEST_TOML}\nall trials: {self.out / PAGE}\n"
+            f"selected on validation rows; settings: {self.out / BEST_TOML}\n"
+            f"all trials and the importance of settings: {self.out / PAGE}\n"
             f"next: ucfrec ope {quote(str(self.out / BEST))}, its value on the test split, which "
             "no trial has seen"
         )
@@ -192,7 +173,7 @@ class Tune(Table):
 class Settings(Table):
     """`ucfrec settings`."""
 
-    policy: Annotated[str, "NAME", Names(policy_names)] = "ucf"
+    policy: Annotated[str, Names(policy_names)] = "ucf"
     """Policy whose settings to list."""
 
     def execute(self) -> None:

@@ -15,7 +15,7 @@ class Collect(Table):
     """Agent, saved by Stable-Baselines3; pickled parts of the file are not read."""
     env: str
     """Gymnasium environment, e.g. Hopper-v5."""
-    out: Annotated[Path, "FOLDER"]
+    out: Path
     """Folder of the file."""
     size: int = 1_000_000
     """Steps."""

@@ -13,7 +13,7 @@ from ucfrec_control.data.minari import write_minari
 class Convert(SourceOptions):
     """`ucfrec-control convert`."""
 
-    target: Annotated[str, ARGUMENT, "TARGET"]
+    target: Annotated[str, ARGUMENT]
     """FILE.hdf5, or a Minari identifier such as hopper/mine-v0."""
 
     def execute(self) -> None:

@@ -11,7 +11,7 @@ from ucfrec_control.data.distractor import add_distractor
 class Distract(Table):
     """`ucfrec-control distract`."""
 
-    store: Annotated[Path, ARGUMENT, "STORE"]
+    store: Annotated[Path, ARGUMENT]
     """Episode store."""
     out: Annotated[Path, "STORE"]
     """Folder of the new store."""

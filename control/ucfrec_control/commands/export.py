@@ -10,9 +10,9 @@ from ucfrec_control.training.export import export_run
 class Export(Table):
     """`ucfrec-control export`."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
+    run: Annotated[Path, ARGUMENT]
     """Run folder."""
-    out: Annotated[Path, "FOLDER"]
+    out: Path
     """Folder of model.onnx and model.json."""
     checkpoint: Literal["last", "best", "return"] = "last"
     """Weights to export."""

@@ -11,11 +11,11 @@ from ucfrec.commands.options import Table
 class Figures(Table):
     """`ucfrec-control figures`."""
 
-    runs: Annotated[Sequence[Path], "RUN…"] = ()
-    """Runs, or folders of runs."""
-    results: Annotated[Sequence[Path], "ROWS…"] = ()
-    """Files of result rows."""
-    out: Annotated[Path, "FOLDER"]
+    runs: Annotated[Sequence[Path], "RUN"] = ()
+    """Run, or folder of runs; repeatable."""
+    results: Annotated[Sequence[Path], "ROWS"] = ()
+    """File of result rows; repeatable."""
+    out: Path
     """Folder of the figures."""
 
     def execute(self) -> None:

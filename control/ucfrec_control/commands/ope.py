@@ -12,9 +12,9 @@ from ucfrec_control.training.fqe import estimate
 class Ope(Table):
     """`ucfrec-control ope`."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
+    run: Annotated[Path, ARGUMENT]
     """Run folder."""
-    store: Annotated[Path, ARGUMENT, "STORE"]
+    store: Annotated[Path, ARGUMENT]
     """Episode store of trajectories of the same robot: that of the training, or another."""
     target: float | None = None
     """Target return (default: the preset's, else the largest of the training)"""

@@ -57,7 +57,7 @@ def context_given(text: str) -> tuple[str, int]:
 class SourceOptions(Table):
     """A dataset to read."""
 
-    source: Annotated[str, ARGUMENT, "SOURCE"]
+    source: Annotated[str, ARGUMENT]
     """HDF5 file, Minari identifier, or folder of one."""
     env: str | None = None
     """Environment of the data, if the file does not name it."""
@@ -79,7 +79,7 @@ class SourceOptions(Table):
 class ControlGridOptions(GridOptions):
     """The data of a benchmark, how much of it is measured, and where its rows are."""
 
-    data: Annotated[Path | None, "FOLDER"] = None
+    data: Path | None = None
     """Folder of the HDF5 files."""
     context: Annotated[Sequence[tuple[str, int]], context_given, "METHOD=STEPS"] = ()
     """Steps of history of a method; repeatable (default: the budget's)"""
@@ -87,7 +87,7 @@ class ControlGridOptions(GridOptions):
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
     times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
     of the papers)"""
-    seeds: Annotated[int | None, POSITIVE, "N"] = None
+    seeds: Annotated[int | None, POSITIVE] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""
     out: Path = Path("runs/control")
     workers: Annotated[int, POSITIVE] = 1

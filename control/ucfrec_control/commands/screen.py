@@ -15,7 +15,7 @@ from ucfrec_control.training.screening import screen_store
 class Screen(Table):
     """`ucfrec-control screen`."""
 
-    store: Annotated[Path, ARGUMENT, "STORE"]
+    store: Annotated[Path, ARGUMENT]
     """Episode store to screen."""
     seed: Annotated[int, SEED] = 0
     """Of the predictors."""

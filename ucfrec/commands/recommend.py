@@ -163,7 +163,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
 
                 how |= {"candidates": self._read_candidates(trained), "index": index}
                 decisions = decide(trained, count_users(), self.k, **how)
-                frames: Iterator["pd.DataFrame"] = (frame for frame, _ in decisions)
+                frames: Iterator[pd.DataFrame] = (frame for frame, _ in decisions)
                 if self.exposures:
                     exposures = exposures_written(
                         self.exposures,

@@ -58,6 +58,7 @@ class Update(LogOptions, RunArgument):
     """Once the runs are compared, do not go on learning from the validation and test rows;
     (default: RUN2 acts by the weights that learned from all rows)"""
     filter_seen: bool = False
+    allow_argmax: bool = False
     seed: int | None = None
     """Of everything random (default: that of RUN)"""
     threads: Annotated[int | None, POSITIVE] = None
@@ -90,7 +91,11 @@ class Update(LogOptions, RunArgument):
             memory_limit=self.memory_limit,
         )
         options = UpdateOptions(
-            append, seed=self.seed, refit=not self.no_refit, filter_seen=self.filter_seen
+            append,
+            seed=self.seed,
+            refit=not self.no_refit,
+            filter_seen=self.filter_seen,
+            allow_argmax=self.allow_argmax,
         )
         record = update_run(
             run, files, self.out, store=self.store, mapping=mapping, options=options
@@ -112,8 +117,8 @@ class Update(LogOptions, RunArgument):
             print(f"rule changed  {old.rule} → {record.rule.rule}")
         print(f"{describe_drift(update.drift)}\n{describe(update.verdict)}")
         print(f"\nrun: {self.out}")
-        if update.verdict.result == "worse":
-            print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
+        if harms := update.verdict.harms:
+            print(f"next: keep the old run, as the new one is worse: {harms}")
         else:
             print(f"next: ucfrec promote {quote(str(self.out))}, if `serve` follows its folder")
 

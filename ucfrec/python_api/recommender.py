@@ -442,6 +442,7 @@ class Recommender:
         window_days: float | None = None,
         refit: bool = True,
         filter_seen: bool = False,
+        allow_argmax: bool = False,
         mapping: Columns | None = None,
     ) -> Self:
         """Bring the policy up to date with new logs: `ucfrec update`.
@@ -454,13 +455,16 @@ class Recommender:
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
             filter_seen: compare them where items that the user was shown before are excluded.
+            allow_argmax: let a decision rule that draws items become one that takes the best, after
+                which logs have no propensities to evaluate from.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and
             the verdict on both.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
-        options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
+        append = AppendOptions(window)
+        options = UpdateOptions(append, None, refit, filter_seen, allow_argmax)
         opened = open_files(self.trained, logs, mapping)
         with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)

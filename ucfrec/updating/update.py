@@ -38,6 +38,9 @@ class UpdateOptions:
     filter_seen: bool = False
     """Compare the runs as they act where items that the user was shown before are excluded, as
     `recommend` and `serve` do by default."""
+    allow_argmax: bool = False
+    """Let a decision rule that draws items become one that takes the best, after which new logs
+    have no propensities to evaluate from."""
 
 
 @random_state_kept()
@@ -95,6 +98,9 @@ def update_run(
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
     config, seed = warm_settings(full), options.seed
     config = replace(config, seed=config.seed if seed is None else seed)
+    if (temperature := trained.rule.temperature) > 0 and not options.allow_argmax:
+        drawing = tuple(value for value in config.rule.temperatures if value > 0)
+        config = replace(config, rule=replace(config.rule, temperatures=drawing or (temperature,)))
     update = Update(
         of=run.resolve().name,
         run=trained.fingerprint,

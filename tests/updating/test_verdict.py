@@ -95,6 +95,22 @@ def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> Non
     assert len(found.differences) == 1
 
 
+def test_clicks_on_what_the_old_run_showed_do_not_speak_for_it(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    shares = 1.3 ** np.arange(LOGGED_ITEMS)
+    shares /= shares.sum()
+    items = np.random.default_rng(0).choice(LOGGED_ITEMS, p=shares, size=6000)
+    rows = logged(tmp_path, items, shares[items], (0.1, 0.1, 0.8)).split("test")
+    found = compare_runs(trained, reversed_of(trained), rows, 0).differences
+    assert found["ndcg_liked"].standing() == "better"
+    steps = {name: rows.column(name) for name in ("item", "reward", "timestamp")}
+    episodes = {n: rows.episode_values(n) for n in ("user", "terminated")}
+    blind = EpisodeStore.from_arrays(steps, rows.lengths, episodes, trained.item_states)
+    found = compare_runs(trained, reversed_of(trained), blind, 0).differences
+    assert found["ndcg_liked"].standing() == "worse"
+
+
 def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
     steps = rows_of_test(trained).n_steps
     wrong = rows_of(trained, np.full(steps, 5 / LOGGED_ITEMS, dtype=np.float32))

@@ -58,6 +58,10 @@ class Ope(RuleOptions, LogOptions):
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return"""
+    guardrail: Annotated[Sequence[str], _ESTIMATED, "MEASURE"] = ()
+    """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%%', an expression
+    over the columns of LOGS; repeatable; a launch needs every one"""
+    by: Annotated[str | None, _ESTIMATED, "COLUMN"] = None
     item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
     estimate_propensities: Annotated[bool, _ESTIMATED] = False
     anonymous: Annotated[bool, _ESTIMATED] = False
@@ -67,6 +71,7 @@ class Ope(RuleOptions, LogOptions):
         """Print the estimates and the verdict of every candidate."""
         from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy import evaluate
+        from ucfrec.off_policy.answer import MOST_LINES
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
         from ucfrec.results.rows import write_results
@@ -75,7 +80,8 @@ class Ope(RuleOptions, LogOptions):
         settings = settings_given(self, evaluate.EstimateOptions)
         if self.lift is not None:
             settings["wanted_lift"] = self.lift
-        options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
+        settings |= {"users_known": not self.anonymous, "guardrails": tuple(self.guardrail)}
+        options = evaluate.EstimateOptions(**settings)
         if self.scored and not logs:
             raise InputError("--scored needs what ucfrec score wrote; name it after the run")
         if self.scored and self.filter_seen:
@@ -97,7 +103,7 @@ class Ope(RuleOptions, LogOptions):
         for policy, rules in candidates:
             reading: AbstractContextManager[LoggedSessions | None] = nullcontext()
             if not self.scored:
-                reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+                reading = self.read_sessions([policy], logs, self.json, True, options)
             with reading as logged:
                 if logged is not None and logs:
                     details.append(format_summary(logged.report))
@@ -118,7 +124,8 @@ class Ope(RuleOptions, LogOptions):
                     details.append(_describe(name, reports[name]))
         choice = choose(reports, self.seed) if len(reports) > 1 else None
         if choice is None:
-            print("\n".join(reports[names[0]].list_lines()))
+            most = None if self.details else MOST_LINES
+            print("\n".join(reports[names[0]].list_lines(most)))
         else:
             print(f"choice: {choice.headline}")
             print("\n".join(f"{name}: {report.verdict}" for name, report in reports.items()))
@@ -168,7 +175,6 @@ def _describe(name: str, report: "OffPolicyReport") -> str:
     ]
     if report.models is not None:
         lines.append(f"models: {report.models}")
-    lines += [f"note: {text}" for text in report.warnings if text not in report.verdict.reasons]
     return "\n".join(lines)
 
 

@@ -20,7 +20,9 @@ from ucfrec.off_policy.estimators import (
 from ucfrec.off_policy.guardrails import GroupDifference, Guardrail
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.verdict import (
+    DOMINANT,
     ENOUGH_USERS,
+    HEAVY_TAIL,
     Diagnosis,
     diagnose,
     diagnose_weights,
@@ -52,6 +54,14 @@ class Traffic:
     steps: int = 0
     draws: float | None = None
     """E[w²] of uniform draws from the catalogue, whose weights w have mean 1."""
+
+    def plan_more(self, diagnosis: Diagnosis) -> str:
+        """For how many days to log as now, where no more than that is lacking."""
+        effective, passed = diagnosis.effective_users, all(test.passed for test in diagnosis.tests)
+        heavy = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.largest_weight > DOMINANT
+        if not self.days or heavy or not passed or not 0 < effective < ENOUGH_USERS:
+            return ""
+        return f"log {_format_days(1.2 * self.days * ENOUGH_USERS / effective)} of such traffic"
 
     def plan_exploration(self) -> str:
         """The share of random items, and for how many days, that lets each step be evaluated."""
@@ -227,20 +237,16 @@ class Verdict:
         if says == "the log cannot say":
             return f"{says}: {self.reasons[0]}{rests_on}"
         if not self.lift.is_reliable and self.per_step is not None:
-            return f"{says}: {self.per_step.lift.format('+.4g')} per step, by DR{rests_on}"
+            return f"{says}: {self.per_step.lift.format()} per step, by DR{rests_on}"
         share = self.lift.value / abs(self.logged) if self.lift.value and self.logged else 0.0
         why, standing = "", self.lift.standing(self.wanted_lift)
         if says == "do not launch" and standing in ("open", "level"):
-            why = f", less than the wanted gain of {self.wanted_lift:.4g}"
+            why = f", less than the wanted gain of {self.wanted_lift:.3g}"
         elif says == "test it":
             why = ", no reliable gain or loss" if standing == "open" else ", a guardrail is open"
         elif says == "do not launch" and standing == "better":
             why = ", but a guardrail is broken"
-        return (
-            f"{says}: {self.lift.format('+.4g')} per session ({share:+.1%} of the logged "
-            f"{self.logged:.4g}){why}, by {self.estimator} on {self.effective_users:,.0f} "
-            f"effective users{rests_on}"
-        )
+        return f"{says}: {self.lift.format()} per session ({share:+.1%}){why}{rests_on}"
 
     def list_lines(self) -> list[str]:
         """The headline, then what else it rests on, and what to do next."""
@@ -248,9 +254,13 @@ class Verdict:
         if not self.lift.is_reliable:
             if says == "the log cannot say":
                 lines += [f"and: {reason}" for reason in self.reasons[1:3]]
+                if self.per_step is not None:
+                    lines.append(f"per step: – ({self.per_step.lift.reasons[0]})")
             else:
                 lines.append(f"per session: – ({self.reasons[0]})")
-            lines.append(f"logged: {self.logged:.4g} per session")
+        by = f"; by {self.estimator} on {self.effective_users:,.0f} effective users"
+        logged = f"logged: {self.logged:.4g} per session"
+        lines.append(logged + by * self.lift.is_reliable)
         lines += map(str, self.guardrails)
         lines += map(str, self.groups)
         if says == "test it" and self.test is not None:

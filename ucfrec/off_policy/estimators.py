@@ -145,7 +145,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if per_decision is None:
         per_decision = steps.per_session(steps.discounts * weights * steps.reward)
     if by_step is None:
-        by_step = normalise_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
+        by_step = estimate_by_step(steps)
     terms = {
         "IPS": Terms(last * steps.returns, ones, last),
         "SNIPS": Terms(last * steps.returns, last, last),
@@ -267,6 +267,11 @@ class StepSums:
             totals += np.pad(sums.totals, padding, "edge")
             rewarded += np.pad(sums.rewarded, padding)
         return StepSums(self.sessions + more.sessions, totals, rewarded)
+
+
+def estimate_by_step(steps: LoggedSteps) -> Float64Array:
+    """(S,) whose mean is SNPDIS, and whose spread is its error to first order."""
+    return normalise_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
 
 
 def normalise_by_step(

@@ -25,6 +25,7 @@ from ucfrec.off_policy.answer import (
     step_value,
 )
 from ucfrec.off_policy.estimators import LOGGED, SUITE, Estimate, estimate, session_terms
+from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_log_groups
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, as_pages, number_pages
 from ucfrec.off_policy.models import (
     InputsFile,
@@ -76,9 +77,21 @@ class EstimateOptions:
     """Exclude items that the user was shown before a step, as `recommend` and `serve` do by
     default; then their logs have to be evaluated so."""
 
+    guardrails: tuple[str, ...] = ()
+    """Least or largest changes of measures in percent, e.g. "dwell_seconds >= -2%", of expressions
+    over the columns of the logs; a launch needs every one."""
+    by: str | None = None
+    """Column of users or items, of the logs or of feature tables, to show the lift by."""
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """The expressions of the guardrails."""
+        return tuple(Guardrail.parse(text).measure for text in self.guardrails)
+
     def __post_init__(self) -> None:
         low, high = self.reward_range or (0.0, 0.0)
         require(low <= high, f"the reward range is {low} to {high}; name the least one first")
+        assert self.measures is not None  # their guardrails can be read
 
 
 DEFAULTS = EstimateOptions()
@@ -106,12 +119,13 @@ class OffPolicyReport(ResultTable):
     step_rows: Sequence[ResultRow] = ()
     """Result rows of the value per step, one for each estimator, if there is one."""
 
-    def list_lines(self) -> list[str]:
+    def list_lines(self, most: int | None = MOST_LINES) -> list[str]:
         """The answer first, then what it rests on, and what to know of the logs."""
         lines = self.verdict.list_lines()
-        notes = [f"note: {text}" for text in self.warnings if text not in self.verdict.reasons]
-        lines += notes[: max(0, MOST_LINES - 1 - len(lines))]
-        return lines[:MOST_LINES]
+        lines += [f"note: {text}" for text in self.warnings if text not in self.verdict.reasons]
+        if most is None or len(lines) <= most:
+            return lines
+        return [*lines[: most - 1], f"{len(lines) - most + 1} more lines: --details"]
 
     def save(self, file: Path | str) -> None:
         """Write all rows as JSON, as `ucfrec ope --json` does, for `report`."""
@@ -146,6 +160,9 @@ class WeighedLogs:
     declared: str = ""
     fingerprint: str | None = None
     models: ModelReport | None = None
+    measures: Mapping[str, Float64Array] = field(default_factory=dict)
+    groups: Groups | None = None
+    """As of `LoggedSessions`."""
     traffic: Traffic = UNKNOWN_TRAFFIC
     nearby: str = ""
     """See `name_nearby_rule`."""
@@ -170,6 +187,8 @@ def evaluate_off_policy(
         InputError: propensities are not probabilities, there is only one user, or a page would have
             a session of several steps.
     """
+    if {*options.measures} != {*logged.measures} or (options.by and logged.groups is None):
+        raise InputError("--guardrail and --by read further columns of logs: name the logs")
     rule, store = rule or trained.rule, logged.store
     steps, models, declared, concentration = collect_steps(trained, logged, rule, seed, options)
     assert steps.groups is not None
@@ -213,6 +232,7 @@ def evaluate_off_policy(
             f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
     logs.steps, logs.nearby = steps, name_nearby_rule(trained, rule)
+    logs.measures, logs.groups = logged.measures, logged.groups
     return make_report(trained, rule, logs, seed, options)
 
 
@@ -254,8 +274,23 @@ def make_report(
     )
     if not verdict.lift.is_reliable and not options.pages:
         per_step = step_value(steps, seed, logs.forbidden, options.filter_seen)
-        plans = [] if logs.forbidden else [logs.traffic.plan_exploration(), logs.nearby]
+        traffic = logs.traffic
+        plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
+        plans = [] if logs.forbidden else plans
         verdict = replace(verdict, per_step=per_step, remedies=[*filter(None, plans)])
+    weighable = None if steps.lacking.all() else steps.weighable
+    terms = None
+    if weighable is not None and verdict.estimator is not None:
+        terms = session_terms(weighable)[verdict.estimator].influences
+        if logs.groups is not None:
+            lifts = terms - weighable.returns
+            groups = compare_log_groups(logs.groups, steps, lifts, seed)
+            verdict = replace(verdict, groups=groups)
+    guardrails = [
+        check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
+        for text, measure in zip(options.guardrails, options.measures, strict=True)
+    ]
+    verdict = replace(verdict, guardrails=guardrails)
     estimates = add_reasons(estimate(steps, seed), verdict.reasons)
     if model is not None and not model.converged:
         diverged = "it diverged: its values exceed the largest possible return"
@@ -291,10 +326,6 @@ def make_report(
         rule=rule.hash,
         **provenance(),
     )
-    weighable = None if steps.lacking.all() else steps.weighable
-    terms = None
-    if weighable is not None and verdict.estimator is not None:
-        terms = session_terms(weighable)[verdict.estimator].influences
     return OffPolicyReport(
         rows=_make_rows(base, estimates, rule, judged),
         warnings=warnings,

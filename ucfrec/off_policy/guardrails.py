@@ -5,11 +5,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
+
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.errors import InputError
-from ucfrec.off_policy.estimators import simultaneous_intervals
+from ucfrec.off_policy.estimators import (
+    cluster_intervals,
+    estimate_by_step,
+    simultaneous_intervals,
+)
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.verdict import diagnose_weights, list_reasons
 from ucfrec.results.evidence import UNMEASURED, Evidence
+from ucfrec.settings import require
 
 _WRITTEN = re.compile(r"\s*(\S.*?)\s*(>=|<=)\s*([+-]?\d+(?:\.\d+)?)\s*%\s*")
 _OUTCOMES = {"better": "holds", "worse": "broken"}
@@ -30,8 +37,8 @@ class Guardrail:
     def parse(cls, text: str) -> Self:
         """Read `dwell_seconds >= -2%`; InputError if it is not written so."""
         match = _WRITTEN.fullmatch(text)
-        if match is None:
-            raise InputError(f"--guardrail {text!r}: write e.g. 'dwell_seconds >= -2%'")
+        require(match is not None, f"guardrail {text!r}: write e.g. 'dwell_seconds >= -2%'")
+        assert match is not None
         return cls(match[1], match[2] == ">=", float(match[3]) / 100)
 
     @property
@@ -51,6 +58,16 @@ class Guardrail:
 
 
 @dataclass(frozen=True)
+class Groups:
+    """Groups of the users, or of the items, of N logged steps."""
+
+    names: tuple[str, ...]
+    number: IntArray
+    """(N,) group of each step, a place in `names`, or −1."""
+    of_items: bool
+
+
+@dataclass(frozen=True)
 class GroupDifference:
     """The difference in one group of users or items."""
 
@@ -62,6 +79,52 @@ class GroupDifference:
     def __str__(self) -> str:
         why = f" ({self.difference.reasons[0]})" if self.difference.reasons else ""
         return f"{self.name} ({self.users:,} users): {self.difference.format()}{why}"
+
+
+def check_guardrail(
+    text: str, values: Float64Array, steps: LoggedSteps, reasons: Sequence[str], seed: int
+) -> Guardrail:
+    """What weights show of a measure with values (N,), by SNPDIS; nothing if `reasons` speak
+    against them."""
+    guardrail, ends, value = Guardrail.parse(text), None, None
+    if not reasons:
+        measured = replace(steps, reward=values, model=None).weighable
+        logged = measured.returns
+        changes = estimate_by_step(measured) - logged
+        if logged.sum() <= 0:
+            reasons = ["its mean is not above 0"]
+        else:
+            value = float(changes.sum() / logged.sum())
+            (ends,) = cluster_intervals(changes[:, None], logged[:, None], measured.user, seed)
+            reasons = [] if ends else ["the sessions do not differ enough for an interval"]
+    low, high = (ends.low, ends.high) if ends else (None, None)
+    return replace(guardrail, change=Evidence(value, low, high, tuple(reasons)))
+
+
+def compare_log_groups(
+    groups: Groups, steps: LoggedSteps, lifts: Float64Array, seed: int
+) -> list[GroupDifference]:
+    """The lifts (S,) of sessions with weights by group of users; or, by SNPDIS, by the group of
+    items that returns come from."""
+    complete, names = ~steps.lacking, groups.names
+    weighable = steps.weighable
+    if groups.of_items:
+        above = np.stack(
+            [
+                estimate_by_step(part) - part.returns
+                for number in range(len(names))
+                for rewards in [np.where(groups.number == number, steps.reward, 0.0)]
+                for part in [replace(steps, reward=rewards, model=None).weighable]
+            ],
+            axis=1,
+        )
+        below = np.ones_like(above)
+    else:
+        number = groups.number[steps.first][complete]
+        below = (number[:, None] == np.arange(len(names))).astype(np.float64)
+        above = below * lifts[:, None]
+    weights, users = weighable.session_weights, weighable.users
+    return compare_groups(names, above, below, weights, users, seed)
 
 
 def compare_groups(

@@ -102,7 +102,10 @@ class Diagnosis:
 
 
 def diagnose_weights(
-    weights: Float64Array, reward: Float64Array, user: IntArray, tests: Sequence[WeightTest] = ()
+    weights: Float64Array,
+    reward: Float64Array,
+    user: IntArray,
+    tests: Sequence[WeightTest] | None = None,
 ) -> Diagnosis:
     """What weights (N,) of sessions, or of steps, with a reward (N,), leave of their users (N,).
     Without `tests`, their mean is tested."""
@@ -112,7 +115,7 @@ def diagnose_weights(
     return Diagnosis(
         sessions=len(weights),
         users=len(by_user),
-        tests=tuple(tests) or _test_means([("all rows", *cluster_mean(weights, users))]),
+        tests=_test_means([("all", *cluster_mean(weights, users))]) if tests is None else (*tests,),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
@@ -291,15 +294,15 @@ def list_reasons(diagnosis: Diagnosis, filter_seen: bool = False) -> list[str]:
     if diagnosis.left_out == diagnosis.sessions:
         return ["no session has all its propensities, so nothing can be weighed"]
     reasons = []
-    if diagnosis.effective_users < ENOUGH_USERS:
-        reasons.append(
-            f"the weights leave {diagnosis.effective_users:,.0f} effective of {diagnosis.users:,} "
-            f"users (below {ENOUGH_USERS})"
-        )
     if diagnosis.left_out > MOST_LEFT_OUT * diagnosis.sessions:
         reasons.append(
             f"{diagnosis.left_out / diagnosis.sessions:.0%} of the sessions have a step without "
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
+        )
+    if diagnosis.effective_users < ENOUGH_USERS:
+        reasons.append(
+            f"the weights leave {diagnosis.effective_users:,.0f} effective of {diagnosis.users:,} "
+            f"users (below {ENOUGH_USERS})"
         )
     mean = diagnosis.mean_weight
     if failed := [test for test in diagnosis.tests if not test.passed]:

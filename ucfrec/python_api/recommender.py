@@ -372,7 +372,8 @@ class Recommender:
             seed: of the folds and the bootstrap.
         """
         trained = self._load_for(logs)
-        with read_logs(trained, logs, mapping, keep_unknown=True) as logged:
+        read = read_logs(trained, logs, mapping, True, options.measures, options.by)
+        with read as logged:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
@@ -455,8 +456,8 @@ class Recommender:
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
             filter_seen: compare them where items that the user was shown before are excluded.
-            allow_argmax: let a decision rule that draws items become one that takes the best, after
-                which logs have no propensities to evaluate from.
+            allow_argmax: let a decision rule that draws items come to take the best; new logs then
+                have no propensities to evaluate from.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and

@@ -40,8 +40,8 @@ def compare_runs(
     """Compare two runs, each under its own rule.
 
     Where steps have propensities, the difference in reward per step decides, under the logging
-    policy's distribution of histories, and nothing if that is not reliable: rankings of logged
-    clicks favour whoever showed them. Else the difference in nDCG of liked items decides.
+    policy's distribution of histories; else that in nDCG of liked items. With propensities nDCG
+    weights clicks as if items were shown uniformly, as they favour the run that showed them.
 
     Args:
         new: trained on a store that was grown from that of `old`.
@@ -54,21 +54,29 @@ def compare_runs(
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, seen)
     old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
-    gained, likes = (new_gain - old_gain) * liked, liked.astype(np.float64)
-    differences = {RANKING: _compare(gained, likes, user, seed)}
+    propensity, likes = np.zeros(len(reward)), liked.astype(np.float64)
     if schema.PROPENSITY in rows.record.columns:
-        propensity = rows.column(schema.PROPENSITY).astype(np.float64)
-        if (weighed := propensity > 0).any():
-            returns, owner = reward[weighed].astype(np.float64), user[weighed]
-            weights, reasons = [], list[str]()
-            for name, probability in (("new", new_probability), ("old", old_probability)):
-                weight = probability[weighed] / propensity[weighed]
-                weights.append(weight)
-                faults = list_reasons(diagnose_weights(weight, returns, owner), seen is not None)
-                reasons += [f"the {name} run: {fault}" for fault in faults]
-            # The mean reward is a control variate: weights of both policies have mean 1.
-            lift = (weights[0] - weights[1]) * (returns - returns.mean())
-            differences[VALUE] = _compare(lift, np.ones(len(lift)), owner, seed, reasons)
+        propensity = np.nan_to_num(rows.column(schema.PROPENSITY).astype(np.float64))
+    if (weighed := propensity > 0).any():
+        # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
+        likes[weighed] /= propensity[weighed]
+        likes[~weighed] = 0.0
+    counted, faults = likes > 0, list[str]()
+    if counted.any():
+        weights = likes[counted] / likes[counted].mean()
+        faults = list_reasons(diagnose_weights(weights, weights, user[counted]))
+    differences = {RANKING: _compare((new_gain - old_gain) * likes, likes, user, seed, faults)}
+    if weighed.any():
+        returns, owner = reward[weighed].astype(np.float64), user[weighed]
+        ratios, faults = [], list[str]()
+        for name, probability in (("new", new_probability), ("old", old_probability)):
+            ratios.append(probability[weighed] / propensity[weighed])
+            diagnosis = diagnose_weights(ratios[-1], returns, owner)
+            reasons = list_reasons(diagnosis, seen is not None)
+            faults += [f"the {name} run: {reason}" for reason in reasons]
+        # The mean reward is a control variate: weights of both policies have mean 1.
+        lift = (ratios[0] - ratios[1]) * (returns - returns.mean())
+        differences[VALUE] = _compare(lift, np.ones(len(lift)), owner, seed, faults)
     return UpdateVerdict(
         decided_by=[*differences][-1],
         differences=differences,
@@ -84,7 +92,7 @@ def describe(verdict: UpdateVerdict) -> str:
         f"rows of {verdict.users:,} users"
     ]
     for measure, evidence in verdict.differences.items():
-        reasons = f" ({'; '.join(evidence.reasons)})" if evidence.reasons else ""
+        reasons = f" ({evidence.reasons[0]})" if evidence.reasons else ""
         lines.append(f"  {evidence.standing():<11} {measure} {evidence.format('+.4g')}{reasons}")
     return "\n".join(lines)
 

@@ -59,7 +59,7 @@ class Ope(RuleOptions, LogOptions):
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return"""
     guardrail: Annotated[Sequence[str], _ESTIMATED, "MEASURE"] = ()
-    """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%%', an expression
+    """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%', an expression
     over the columns of LOGS; repeatable; a launch needs every one"""
     by: Annotated[str | None, _ESTIMATED, "COLUMN"] = None
     item_groups: Annotated[int | None, _ESTIMATED, "N"] = None

@@ -137,6 +137,11 @@ class Compare(Table):
     test (default: 5% of the value of A)"""
     shares: Annotated[str | None, "A=SHARE,B=SHARE"] = None
     """Shares of the users that were intended for the arms, as of serve --split (default: equal)"""
+    guardrail: Annotated[Sequence[str], "MEASURE"] = ()
+    """Least (or largest) change of B in a measure, in percent, e.g. 'dwell_seconds >= -2%';
+    repeatable"""
+    by: Annotated[str | None, "COLUMN"] = None
+    """Also compare within groups of the rows, by a column or expression."""
     json: Annotated[Path | None, "FILE"] = None
     """Also write the numbers as JSON."""
     memory_limit: Annotated[str, "SIZE"] = "2GB"
@@ -155,8 +160,15 @@ class Compare(Table):
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
         shares = None if self.shares is None else parse_split(self.shares)
         result = compare_arms(
-            self.logs, self.column, arms, self.expected, shares, self.memory_limit
+            self.logs,
+            self.column,
+            arms,
+            self.expected,
+            shares,
+            self.memory_limit,
+            self.guardrail,
+            self.by,
         )
-        print(f"{result}\n\n{result.conclusion}")
+        print(result)
         if self.json is not None:
             write_json(self.json, asdict(result))

@@ -7,10 +7,10 @@ import pytest
 
 from tests.off_policy.test_verdict import TARGET, logs
 from ucfrec.off_policy import LoggedSteps, conclude
-from ucfrec.off_policy.answer import MOST_LINES, Traffic, plan_test, step_value
+from ucfrec.off_policy.answer import MOST_LINES, Traffic, cut_to_steps, plan_test
 from ucfrec.off_policy.guardrails import Guardrail
 from ucfrec.off_policy.logged_steps import Modelled
-from ucfrec.off_policy.verdict import diagnose_weights
+from ucfrec.off_policy.verdict import diagnose
 from ucfrec.results.evidence import Evidence
 
 GOOD = logs(5000)[0]
@@ -74,7 +74,9 @@ def test_a_planned_exploration_leaves_enough_users(users: int) -> None:
     shown = explored & (rng.random(5 * served) < 1 / 50)
     weights = np.where(shown, 50 / share, 0.0)
     user = np.repeat(np.arange(served), 5)
-    assert diagnose_weights(weights, weights, user).effective_users > 150
+    target = weights / weights.max()
+    steps = LoggedSteps(np.arange(len(user)), weights, np.ones(len(user)), target, user=user)
+    assert diagnose(steps).effective_users > 150
     assert Traffic().plan_exploration() == ""
 
 
@@ -85,11 +87,12 @@ def test_steps_answer_where_sessions_cannot() -> None:
     steps = replace(steps, model=Modelled(value, 0 * value, 0 * value, value))
     verdict = conclude(steps, seed=0)
     assert verdict.answer == "the log cannot say"
-    verdict = replace(verdict, per_step=step_value(steps, 0))
+    verdict = replace(verdict, per_step=conclude(cut_to_steps(steps), 0))
     assert verdict.answer == "test it"
     assert "per step, by DR" in verdict.headline
     assert "per session: – (" in verdict.list_lines()[1]
     bad = replace(steps, target=TARGET[::-1][items])
-    assert replace(verdict, per_step=step_value(bad, 0)).answer == "do not launch"
-    doubted = replace(verdict, per_step=step_value(steps, 0, ["seen in training"]))
+    assert replace(verdict, per_step=conclude(cut_to_steps(bad), 0)).answer == "do not launch"
+    doubted = conclude(cut_to_steps(steps), 0, forbidden=["seen in training"])
+    doubted = replace(verdict, per_step=doubted)
     assert doubted.answer == "the log cannot say"

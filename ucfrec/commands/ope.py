@@ -161,12 +161,11 @@ class Ope(RuleOptions, LogOptions):
 def _describe(name: str, report: "OffPolicyReport") -> str:
     """The estimates, the reasons against some of them, and what to know of the logs."""
     lines = [f"{name}:", _table(report.rows, ("R_cum", "effective_sessions", "sessions"))]
-    per_step = report.verdict.per_step
-    reasons: dict[str, list[str]] = {reason: [] for reason in report.verdict.reasons}
-    if per_step is not None:
-        columns = ("R_step", "effective_steps", "steps")
-        lines += ["", _table(report.step_rows, columns, steps=per_step.steps), f"{per_step}", ""]
+    if report.step_rows:
+        table = _table(report.step_rows, ("R_step", "effective_steps"))
+        lines += ["", table, "R_step: mean reward of a step, after histories as logged", ""]
     lines.append("R_cum: return per session, with a 95% interval; – where a reason forbids it:")
+    reasons: dict[str, list[str]] = {reason: [] for reason in report.verdict.reasons}
     for row in report.rows:
         for reason in row.details.get("reasons", ()):
             reasons.setdefault(reason, []).append(row.method)
@@ -178,7 +177,7 @@ def _describe(name: str, report: "OffPolicyReport") -> str:
     return "\n".join(lines)
 
 
-def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object) -> str:
+def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...]) -> str:
     """The rows of estimators, with the columns and what is the same in all of them; without the
     numbers that a reason speaks against."""
     from ucfrec.reporting.tables import format_rows
@@ -187,7 +186,7 @@ def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object
     for row in rows:
         numbers = ("", "_low", "_high") if row.details.get("reasons") else ()
         doubtful = {f"{row.metric}{end}": None for end in numbers}
-        line = {**dict.fromkeys(columns), **row.as_line(), **doubtful, **more}
+        line = {**dict.fromkeys(columns), **row.as_line(), **doubtful}
         lines.append({**line, "estimator": row.method})
     return format_rows(lines, columns)
 

@@ -11,21 +11,18 @@ from ucfrec.off_policy.estimators import (
     LOGGED,
     NO_INTERVAL,
     Estimate,
-    Terms,
     cluster_intervals,
     cluster_mean,
     session_terms,
-    summarise,
 )
 from ucfrec.off_policy.guardrails import GroupDifference, Guardrail
-from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.verdict import (
     DOMINANT,
     ENOUGH_USERS,
     HEAVY_TAIL,
     Diagnosis,
     diagnose,
-    diagnose_weights,
     list_reasons,
 )
 from ucfrec.results.evidence import Evidence
@@ -119,57 +116,23 @@ def _format_days(days: float) -> str:
     return f"{whole:,} day{'s' * (whole > 1)}"
 
 
-@dataclass(frozen=True)
-class StepValue:
-    """What N' logged steps with a propensity say of the evaluated policy: the mean reward of a step
-    (Dudík, Langford & Li, ICML 2011), had it chosen the item after a history as the logging policy
-    makes them. It says nothing of the return of sessions that the policy itself would make.
-    """
-
-    estimates: dict[str, Estimate]
-    """Mean reward of a step as logged, and by IPS, SNIPS and DR under the evaluated policy."""
-    lift: Evidence
-    """Of DR over the steps as logged."""
-    steps: int
-    """N'."""
-    of: int
-    """All logged steps."""
-
-    def __str__(self) -> str:
-        why = f" ({self.lift.reasons[0]})" if self.lift.reasons else ""
-        return (
-            f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
-            f"logging policy's distribution of histories: {self.lift.format()} by DR{why}; not an "
-            "estimate of the session return"
-        )
-
-
-def step_value(
-    steps: LoggedSteps, seed: int, forbidden: Sequence[str] = (), filter_seen: bool = False
-) -> StepValue | None:
-    """The value per step, against which speaks what is `forbidden`; None where too few steps have
-    propensities, or none has weight."""
-    weighable = ~np.isnan(steps.propensity)
-    if steps.model is None or weighable.sum() < 2:
+def cut_to_steps(steps: LoggedSteps) -> LoggedSteps | None:
+    """The steps with a propensity, each as a session of its own: what follows is the mean reward of
+    a step (Dudík, Langford & Li, ICML 2011), had the evaluated policy chosen the item after a
+    history as the logging policy makes them; not the return of its sessions. None without models,
+    or where too few steps can be weighed."""
+    known = ~np.isnan(steps.propensity)
+    if steps.model is None or known.sum() < 2 or not steps.target[known].any():
         return None
-    reward, weight = steps.reward[weighable], (steps.target / steps.propensity)[weighable]
-    if not weight.any():
-        return None
-    user = steps.users[steps.session[weighable]]
-    ones = np.ones(len(reward))
-    left = reward - steps.model.logged_reward[weighable]
-    doubly_robust = steps.model.reward[weighable] + weight * left
-    terms = {
-        LOGGED: Terms(reward, ones, ones),
-        "IPS": Terms(weight * reward, ones, weight),
-        "SNIPS": Terms(weight * reward, weight, weight),
-        "DR": Terms(doubly_robust, ones, weight),
-        "lift": Terms(doubly_robust - reward, ones, weight),
-    }
-    diagnosis = diagnose_weights(weight, reward, user)
-    reasons = (*forbidden, *list_reasons(diagnosis, filter_seen))
-    estimates = add_reasons(summarise(terms, user, seed), reasons)
-    return StepValue(estimates, estimates.pop("lift"), len(reward), len(weighable))
+    value, logged = steps.model.reward[known], steps.model.logged_reward[known]
+    return LoggedSteps(
+        np.arange(known.sum()),
+        steps.reward[known],
+        steps.propensity[known],
+        steps.target[known],
+        Modelled(value, q=logged, v=value, logged_reward=logged),
+        steps.users[steps.session[known]],
+    )
 
 
 def add_reasons(estimates: dict[str, Estimate], reasons: Sequence[str]) -> dict[str, Estimate]:
@@ -199,12 +162,10 @@ class Verdict:
     wanted_lift: float
     """Return per session that a launch should gain."""
     test: ABTest | None
-    sessions_needed: int | None
-    """Logged sessions like these that would show `wanted_lift` in 80% of samples."""
     declared: str = ""
     """What the estimate rests on beside the logs, e.g. estimated propensities."""
-    per_step: StepValue | None = None
-    """The value per step, where that of sessions is not reliable."""
+    per_step: "Verdict | None" = None
+    """That on single steps (`cut_to_steps`), where this one is not reliable."""
     guardrails: Sequence[Guardrail] = ()
     groups: Sequence[GroupDifference] = ()
     remedies: Sequence[str] = ()
@@ -290,7 +251,7 @@ class Verdict:
             "groups": [asdict(group) for group in self.groups],
             "test": self.test and asdict(self.test),
         }
-        names = ("probability_better", "wanted_lift", "sessions_needed", "declared")
+        names = ("probability_better", "wanted_lift", "declared")
         return columns | {name: getattr(self, name) for name in names}
 
 
@@ -301,7 +262,6 @@ def conclude(
     wanted_lift: float | None = None,
     forbidden: Sequence[str] = (),
     declared: str = "",
-    filter_seen: bool = False,
     days: float | None = None,
 ) -> Verdict:
     """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing else
@@ -309,20 +269,18 @@ def conclude(
     of the mean logged. `days` is the time from the first session to the last.
     """
     diagnosis = diagnosis or diagnose(steps)
-    reasons = [*forbidden, *list_reasons(diagnosis, filter_seen)]
+    reasons = [*forbidden, *list_reasons(diagnosis)]
     if wanted_lift is None:
         wanted_lift = 0.05 * abs(float(steps.returns.mean()))
     terms = {} if steps.lacking.all() else session_terms(steps.weighable)
     name = next((name for name in BEST_FIRST if name in terms), None)
-    value = interval = needed = None
+    value = interval = None
     if name is not None:
         lifts = terms[name].influences - steps.weighable.returns
         value, ones = float(lifts.mean()), np.ones((len(lifts), 1))
         (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
         if interval is None:
             reasons.append("the sessions do not differ enough for an interval")
-        elif wanted_lift > 0:
-            needed = math.ceil(len(lifts) * (_DETECTED * interval.error / wanted_lift) ** 2)
     low, high, _, better = interval or NO_INTERVAL
     return Verdict(
         lift=Evidence(value, low, high, tuple(reasons)),
@@ -332,6 +290,5 @@ def conclude(
         probability_better=better,
         wanted_lift=wanted_lift,
         test=plan_test(steps, wanted_lift, days),
-        sessions_needed=needed,
         declared=declared,
     )

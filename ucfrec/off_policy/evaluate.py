@@ -22,10 +22,10 @@ from ucfrec.off_policy.answer import (
     Verdict,
     add_reasons,
     conclude,
-    step_value,
+    cut_to_steps,
 )
 from ucfrec.off_policy.estimators import LOGGED, SUITE, Estimate, estimate, session_terms
-from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_log_groups
+from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, as_pages, number_pages
 from ucfrec.off_policy.models import (
     InputsFile,
@@ -269,22 +269,24 @@ def make_report(
         wanted_lift=options.wanted_lift,
         forbidden=logs.forbidden,
         declared=logs.declared,
-        filter_seen=options.filter_seen,
         days=logs.traffic.days,
     )
+    single, traffic = cut_to_steps(steps), logs.traffic
+    of_steps: dict[str, Estimate] = {}
     if not verdict.lift.is_reliable and not options.pages:
-        per_step = step_value(steps, seed, logs.forbidden, options.filter_seen)
-        traffic = logs.traffic
         plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
-        plans = [] if logs.forbidden else plans
-        verdict = replace(verdict, per_step=per_step, remedies=[*filter(None, plans)])
+        verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
+        if single is not None:
+            per_step = conclude(single, seed, forbidden=logs.forbidden)
+            of_steps = add_reasons(estimate(single, seed), per_step.reasons)
+            verdict = replace(verdict, per_step=per_step)
     weighable = None if steps.lacking.all() else steps.weighable
     terms = None
     if weighable is not None and verdict.estimator is not None:
         terms = session_terms(weighable)[verdict.estimator].influences
         if logs.groups is not None:
             lifts = terms - weighable.returns
-            groups = compare_log_groups(logs.groups, steps, lifts, seed)
+            groups = compare_groups(logs.groups, steps, lifts, seed)
             verdict = replace(verdict, groups=groups)
     guardrails = [
         check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
@@ -298,8 +300,7 @@ def make_report(
     warnings = [*verdict.reasons, *list_cautions(diagnosis), *logs.remarks]
     judged = logs.columns | diagnosis.list_columns() | verdict.list_columns()
     judged |= {"warnings": warnings}
-    per_step = verdict.per_step
-    record, of_steps = trained.record, {} if per_step is None else per_step.estimates
+    record = trained.record
     base = ResultRow(
         suite=SUITE,
         table="estimates",

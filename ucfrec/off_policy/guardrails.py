@@ -14,7 +14,7 @@ from ucfrec.off_policy.estimators import (
     simultaneous_intervals,
 )
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.verdict import diagnose_weights, list_reasons
+from ucfrec.off_policy.verdict import diagnose, list_reasons
 from ucfrec.results.evidence import UNMEASURED, Evidence
 from ucfrec.settings import require
 
@@ -101,53 +101,35 @@ def check_guardrail(
     return replace(guardrail, change=Evidence(value, low, high, tuple(reasons)))
 
 
-def compare_log_groups(
+def compare_groups(
     groups: Groups, steps: LoggedSteps, lifts: Float64Array, seed: int
 ) -> list[GroupDifference]:
     """The lifts (S,) of sessions with weights by group of users; or, by SNPDIS, by the group of
-    items that returns come from."""
-    complete, names = ~steps.lacking, groups.names
-    weighable = steps.weighable
-    if groups.of_items:
-        above = np.stack(
-            [
-                estimate_by_step(part) - part.returns
-                for number in range(len(names))
-                for rewards in [np.where(groups.number == number, steps.reward, 0.0)]
-                for part in [replace(steps, reward=rewards, model=None).weighable]
-            ],
-            axis=1,
-        )
-        below = np.ones_like(above)
-    else:
-        number = groups.number[steps.first][complete]
-        below = (number[:, None] == np.arange(len(names))).astype(np.float64)
-        above = below * lifts[:, None]
-    weights, users = weighable.session_weights, weighable.users
-    return compare_groups(names, above, below, weights, users, seed)
-
-
-def compare_groups(
-    names: Sequence[str],
-    above: Float64Array,
-    below: Float64Array,
-    weights: Float64Array,
-    user: IntArray,
-    seed: int,
-) -> list[GroupDifference]:
-    """The differences Σ above / Σ below (S, K) of sessions in K groups; those of groups whose
-    weights (S,) stand have intervals that hold at once."""
-    groups, reliable = list[GroupDifference](), list[int]()
-    for number, name in enumerate(names):
-        inside = below[:, number] > 0
-        diagnosis = diagnose_weights(weights[inside], above[inside, number], user[inside])
-        reasons = tuple(list_reasons(diagnosis))
-        value = float(above[:, number].sum() / below[:, number].sum())
-        groups.append(GroupDifference(name, diagnosis.users, Evidence(value, None, None, reasons)))
+    items that returns come from. Intervals of groups whose weights stand hold at once."""
+    differences, weighable = list[GroupDifference](), steps.weighable
+    terms = dict[int, tuple[Float64Array, Float64Array]]()
+    for number, name in enumerate(groups.names):
+        if groups.of_items:
+            rewards = np.where(groups.number == number, steps.reward, 0.0)
+            part = replace(steps, reward=rewards, model=None).weighable
+            above, inside = estimate_by_step(part) - part.returns, np.ones(len(lifts), dtype=bool)
+        else:
+            inside = groups.number[steps.first][~steps.lacking] == number
+            above = lifts * inside
+            part = weighable.select(inside) if inside.any() else weighable
+        reasons = [] if inside.any() else ["no session can be weighed"]
+        reasons += list_reasons(diagnose(part))
+        unknown = Evidence(None, None, None, tuple(reasons))
+        users = len(np.unique(weighable.users[inside]))
+        differences.append(GroupDifference(name, users, unknown))
         if not reasons:
-            reliable.append(number)
-    if reliable:
-        ends = simultaneous_intervals(above[:, reliable], below[:, reliable], user, seed)
-        for number, (value, low, high) in zip(reliable, ends, strict=True):
-            groups[number] = replace(groups[number], difference=Evidence(value, low, high))
-    return groups
+            terms[number] = above, inside.astype(np.float64)
+    if terms:
+        aboves, belows = (
+            np.stack(columns, axis=1) for columns in zip(*terms.values(), strict=True)
+        )
+        ends = simultaneous_intervals(aboves, belows, weighable.user, seed)
+        for number, (value, low, high) in zip(terms, ends, strict=True):
+            evidence = Evidence(value, low, high)
+            differences[number] = replace(differences[number], difference=evidence)
+    return differences

@@ -6,8 +6,7 @@ ones.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any, Final
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.off_policy.estimators import cluster_mean
-from ucfrec.off_policy.logged_steps import LoggedSteps, number_clusters
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
 ENOUGH_TO_TEST: Final = 30
@@ -63,8 +62,6 @@ class Diagnosis:
     overlap: float | None = None
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
     tests: tuple[WeightTest, ...] = ()
-    effective_by_step: tuple[float, ...] = ()
-    """(T,) effective users at each step, of the products up to it; empty of sums of sessions."""
     effective_users: float = 0.0
     """Of the session products, summed by user."""
     largest_weight: float = 1.0
@@ -86,42 +83,11 @@ class Diagnosis:
             "users": self.users,
             "sessions_without_propensity": self.left_out,
             "effective_users": self.effective_users,
-            "effective_by_step": self.effective_by_step,
-            "unsupported_from_step": self.unsupported_from_step,
             "weight_tests": [asdict(test) for test in self.tests],
             "mean_weight": self.mean_weight,
             "pareto_tail": self.tail,
             "bounds": self.bounds,
         }
-
-    @property
-    def unsupported_from_step(self) -> int | None:
-        """First step (from 1) with fewer effective users than an estimate needs, if any."""
-        places = enumerate(self.effective_by_step, start=1)
-        return next((place for place, users in places if users < ENOUGH_USERS), None)
-
-
-def diagnose_weights(
-    weights: Float64Array,
-    reward: Float64Array,
-    user: IntArray,
-    tests: Sequence[WeightTest] | None = None,
-) -> Diagnosis:
-    """What weights (N,) of sessions, or of steps, with a reward (N,), leave of their users (N,).
-    Without `tests`, their mean is tested."""
-    users = number_clusters(user, len(weights))
-    by_user = np.bincount(users, weights).astype(np.float64)
-    rewarded = np.bincount(users, np.abs(weights * reward))
-    return Diagnosis(
-        sessions=len(weights),
-        users=len(by_user),
-        tests=_test_means([("all", *cluster_mean(weights, users))]) if tests is None else (*tests,),
-        effective_users=effective_number(by_user),
-        largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
-        rewarded_users=int((rewarded > 0).sum()),
-        mean_weight=float(weights.mean()),
-        tail=pareto_tail(by_user),
-    )
 
 
 def diagnose(
@@ -136,28 +102,24 @@ def diagnose(
     if incomplete.all():
         return Diagnosis(len(incomplete), users, left_out=len(incomplete))
     weighable = steps.weighable
-    tests = weight_tests(weighable, None if segment is None else segment[~incomplete])
-    weights, returns = weighable.session_weights, weighable.returns
-    diagnosis = diagnose_weights(weights, returns, weighable.users, tests)
-    # An ended session keeps the weight of its last step.
-    totals, effective = np.bincount(weighable.users).astype(np.float64), []
-    changes = weighable.weights - weighable.shift(weighable.weights)
-    step_user = weighable.users[weighable.session]
+    weights = weighable.session_weights
+    by_user = np.bincount(weighable.users, weights).astype(np.float64)
+    rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns))
     bounds = None
     if weighable.per_decision is None:
-        for rows in weighable.rows_by_place:
-            change = np.bincount(step_user[rows], changes[rows], len(totals))
-            totals = np.maximum(totals + change, 0)
-            effective.append(effective_number(totals))
         observed = float(steps.reward.min()), float(steps.reward.max())
         bounds = identification_bounds(weighable, reward_range or observed)
-    return replace(
-        diagnosis,
+    return Diagnosis(
         sessions=len(incomplete),
         users=users,
         left_out=int(incomplete.sum()),
         overlap=float((weighable.target / weighable.propensity).mean()),
-        effective_by_step=tuple(effective),
+        tests=weight_tests(weighable, None if segment is None else segment[~incomplete]),
+        effective_users=effective_number(by_user),
+        largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
+        rewarded_users=int((rewarded > 0).sum()),
+        mean_weight=float(weights.mean()),
+        tail=pareto_tail(by_user),
         bounds=bounds,
     )
 
@@ -194,11 +156,6 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
                 beyond = (np.where(inside, ratios, 0.0) - expected) / share
                 mean, error = cluster_mean(beyond, step_user)
                 means.append((f"item group {number}", 1 + mean, error))
-    return _test_means(means)
-
-
-def _test_means(means: Sequence[tuple[str, float, float]]) -> tuple[WeightTest, ...]:
-    """Tests of named means with their standard errors."""
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(means), 1)))
     return tuple(
         WeightTest(name, mean, error, abs(mean - 1) <= max(_TOLERANCE, limit * error))
@@ -266,30 +223,18 @@ def identification_bounds(
     return float(supported + worth * low), float(supported + worth * high)
 
 
-_SEEN_REMOVED = "such as seen items, which serve excludes without --keep-seen: add --filter-seen"
-_OTHERS_REMOVED = (
-    "such as items that requests excluded by candidates, or that another system removed: with "
-    "--filter-seen, seen items are left out already"
-)
-
-
 def list_cautions(diagnosis: Diagnosis) -> list[str]:
     """What to know of an estimate that may stand all the same."""
-    cautions, stops = [], diagnosis.unsupported_from_step
+    cautions = []
     if 0 < diagnosis.left_out < diagnosis.sessions:
         cautions.append(
             f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
             "propensity: estimates that weigh leave these sessions out"
         )
-    if stops is not None:
-        cautions.append(
-            f"from step {stops} on fewer than {ENOUGH_USERS} effective users are left: the logs "
-            "do not support an estimate there"
-        )
     return cautions
 
 
-def list_reasons(diagnosis: Diagnosis, filter_seen: bool = False) -> list[str]:
+def list_reasons(diagnosis: Diagnosis) -> list[str]:
     """What forbids a conclusion, the gravest first."""
     if diagnosis.left_out == diagnosis.sessions:
         return ["no session has all its propensities, so nothing can be weighed"]
@@ -306,7 +251,7 @@ def list_reasons(diagnosis: Diagnosis, filter_seen: bool = False) -> list[str]:
         )
     mean = diagnosis.mean_weight
     if failed := [test for test in diagnosis.tests if not test.passed]:
-        reasons.append(_explain_failure(failed, diagnosis, filter_seen))
+        reasons.append(_explain_failure(failed, diagnosis))
     elif mean is not None and abs(mean - 1) > FAR_OFF:
         reasons.append(
             f"the mean weight is {mean:.2f} where 1 is expected: at random, what the policy would "
@@ -328,7 +273,7 @@ def list_reasons(diagnosis: Diagnosis, filter_seen: bool = False) -> list[str]:
     return reasons
 
 
-def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis, filter_seen: bool) -> str:
+def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis) -> str:
     """What the worst of the failed tests shows."""
 
     def rank(test: WeightTest) -> tuple[bool, float]:
@@ -336,23 +281,12 @@ def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis, filter_seen
         return test.name == SESSION_PRODUCTS, abs(math.log(max(test.mean, 1e-12)))
 
     worst = max(failed, key=rank)
-    alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
-    # Where few users have most of the weight, tests that take means for normal reject too often.
-    few_weigh = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.effective_users < ENOUGH_USERS
     if worst.mean >= 1:
         return f"{worst}, where 1 is expected: propensities are too small"
-    if alone and few_weigh:
-        cause = (
-            "sessions that the policy would often have may be too rare in these logs: give more "
-            "logs; or the logs lack choices that the policy makes"
-        )
-    else:
-        removed = _OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
-        cause = (
-            f"the logs lack choices that the policy makes ({removed}), or propensities are too "
-            "large"
-        )
-    reason = f"{worst}, where 1 is expected: {cause}"
+    reason = (
+        f"{worst}, where 1 is expected: the logs lack choices that the policy makes, such as seen "
+        "items (add --filter-seen) or what requests exclude, or propensities are too large"
+    )
     if diagnosis.bounds is None:
         return reason
     low, high = diagnosis.bounds

@@ -11,8 +11,9 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.states import liked_rewards
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_intervals
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import score_steps
-from ucfrec.off_policy.verdict import diagnose_weights, list_reasons
+from ucfrec.off_policy.verdict import diagnose, list_reasons
 from ucfrec.results.evidence import Evidence
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -54,28 +55,30 @@ def compare_runs(
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, seen)
     old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
-    propensity, likes = np.zeros(len(reward)), liked.astype(np.float64)
+    propensity = np.full(len(reward), np.nan)
     if schema.PROPENSITY in rows.record.columns:
-        propensity = np.nan_to_num(rows.column(schema.PROPENSITY).astype(np.float64))
-    if (weighed := propensity > 0).any():
-        # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
-        likes[weighed] /= propensity[weighed]
-        likes[~weighed] = 0.0
-    counted, faults = likes > 0, list[str]()
-    if counted.any():
-        weights = likes[counted] / likes[counted].mean()
-        faults = list_reasons(diagnose_weights(weights, weights, user[counted]))
+        propensity = rows.column(schema.PROPENSITY).astype(np.float64)
+    weighed = np.flatnonzero(propensity > 0)
+    # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
+    shown = np.where(propensity > 0, propensity, np.inf) if len(weighed) else np.ones(len(reward))
+    likes = liked / shown
+    counted, faults = np.flatnonzero(likes), list[str]()
+    if len(counted):
+        target = np.full(len(counted), 1 / np.mean(1 / shown[counted]))
+        faults = list_reasons(
+            diagnose(_cut_rows(likes[counted], shown[counted], target, user[counted]))
+        )
     differences = {RANKING: _compare((new_gain - old_gain) * likes, likes, user, seed, faults)}
-    if weighed.any():
+    if len(weighed):
         returns, owner = reward[weighed].astype(np.float64), user[weighed]
-        ratios, faults = [], list[str]()
-        for name, probability in (("new", new_probability), ("old", old_probability)):
-            ratios.append(probability[weighed] / propensity[weighed])
-            diagnosis = diagnose_weights(ratios[-1], returns, owner)
-            reasons = list_reasons(diagnosis, seen is not None)
-            faults += [f"the {name} run: {reason}" for reason in reasons]
+        new_steps, old_steps = (
+            _cut_rows(returns, propensity[weighed], probability[weighed].clip(0, 1), owner)
+            for probability in (new_probability, old_probability)
+        )
+        faults = [f"the new run: {reason}" for reason in list_reasons(diagnose(new_steps))]
+        faults += [f"the old run: {reason}" for reason in list_reasons(diagnose(old_steps))]
         # The mean reward is a control variate: weights of both policies have mean 1.
-        lift = (ratios[0] - ratios[1]) * (returns - returns.mean())
+        lift = (new_steps.weights - old_steps.weights) * (returns - returns.mean())
         differences[VALUE] = _compare(lift, np.ones(len(lift)), owner, seed, faults)
     return UpdateVerdict(
         decided_by=[*differences][-1],
@@ -83,6 +86,13 @@ def compare_runs(
         steps=rows.n_steps,
         users=len(np.unique(user)),
     )
+
+
+def _cut_rows(
+    reward: Float64Array, propensity: Float64Array, target: Float64Array, user: IntArray
+) -> LoggedSteps:
+    """Rows (N,), each a session of its own."""
+    return LoggedSteps(np.arange(len(reward)), reward, propensity, target, user=user)
 
 
 def describe(verdict: UpdateVerdict) -> str:
@@ -167,25 +177,10 @@ def popularity_index(old: Array, new: Array) -> float:
 
 def reward_index(old: Float64Array, new: Float64Array) -> float:
     """`stability_index` of rewards in groups between deciles of the old ones."""
-    edges = np.unique(
-        np.quantile(
-            old,
-            np.linspace(
-                0,
-                1,
-                _GROUPS + 1,
-            )[1:-1],
-            method="lower",
-        )
-    )
-    counts = [
-        np.bincount(
-            np.searchsorted(edges, x),
-            None,
-            len(edges) + 1,
-        )
-        for x in (old, new)
-    ]
+    deciles = np.linspace(0, 1, _GROUPS + 1)[1:-1]
+    edges = np.unique(np.quantile(old, deciles, method="lower"))
+    groups = [np.searchsorted(edges, rewards) for rewards in (old, new)]
+    counts = [np.bincount(group, minlength=len(edges) + 1) for group in groups]
     return stability_index(counts[0], counts[1])
 
 

@@ -56,7 +56,11 @@ def test_groups_are_read_from_feature_tables(trained: TrainedPolicy, file: Path)
 
 @pytest.mark.parametrize(
     ("by", "says"),
-    [("reward", "has several values"), ("item_id", "values in these"), ("price", "no column 'pri")],
+    [
+        ("reward", "have several values"),
+        ("item_id", "values in these"),
+        ("price", "no column 'pri"),
+    ],
 )
 def test_columns_that_do_not_group_are_refused(
     trained: TrainedPolicy, file: Path, by: str, says: str

@@ -180,16 +180,18 @@ class Verdict:
     def answer(self) -> Answer:
         """What to do with the policy: a launch needs a gain and every guardrail, a test a chance of
         the wanted lift."""
-        outcomes = {guardrail.outcome for guardrail in self.guardrails}
-        if self.lift.low is None or self.lift.high is None or self.reasons:
-            if self.per_step is None or not self.per_step.lift.is_reliable:
-                return "the log cannot say"
-            return "do not launch" if self.per_step.lift.standing() == "worse" else "test it"
-        if "broken" in outcomes or self.lift.high < 0:
+        evidence, outcomes = self.lift, {guardrail.outcome for guardrail in self.guardrails}
+        if not evidence.is_reliable and self.per_step is not None:
+            evidence = self.per_step.lift
+        if not evidence.is_reliable or evidence.high is None:
+            return "the log cannot say"
+        standing, by_step = evidence.standing(), evidence is not self.lift
+        if "broken" in outcomes or standing == "worse":
             return "do not launch"
-        if self.lift.low > 0:
-            return "launch" if outcomes <= {"holds"} else "test it"
-        return "test it" if self.lift.high >= self.wanted_lift else "do not launch"
+        if standing == "better" and not by_step and outcomes <= {"holds"}:
+            return "launch"
+        hopeless = standing != "better" and evidence.high < self.wanted_lift and not by_step
+        return "do not launch" if hopeless else "test it"
 
     @property
     def headline(self) -> str:
@@ -200,12 +202,13 @@ class Verdict:
         if not self.lift.is_reliable and self.per_step is not None:
             return f"{says}: {self.per_step.lift.format()} per step, by DR{rests_on}"
         share = self.lift.value / abs(self.logged) if self.lift.value and self.logged else 0.0
-        why, standing = "", self.lift.standing(self.wanted_lift)
-        if says == "do not launch" and standing in ("open", "level"):
-            why = f", less than the wanted gain of {self.wanted_lift:.3g}"
+        outcomes = {guardrail.outcome for guardrail in self.guardrails}
+        why = f", less than the wanted gain of {self.wanted_lift:.3g}"
+        if self.lift.standing() in ("better", "worse"):
+            why = "" if says != "test it" else ", but a guardrail is open"
         elif says == "test it":
-            why = ", no reliable gain or loss" if standing == "open" else ", a guardrail is open"
-        elif says == "do not launch" and standing == "better":
+            why = ", no reliable gain or loss"
+        if "broken" in outcomes:
             why = ", but a guardrail is broken"
         return f"{says}: {self.lift.format()} per session ({share:+.1%}){why}{rests_on}"
 

@@ -43,7 +43,6 @@ from ucfrec.off_policy.verdict import (
     MOST_LEFT_OUT,
     check_catalogue_size,
     diagnose,
-    list_cautions,
 )
 from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.rows import ResultRow, ResultTable, write_results
@@ -297,7 +296,12 @@ def make_report(
     if model is not None and not model.converged:
         diverged = "it diverged: its values exceed the largest possible return"
         estimates["FQE"] = replace(estimates["FQE"], reasons=(diverged,))
-    warnings = [*verdict.reasons, *list_cautions(diagnosis), *logs.remarks]
+    if 0 < diagnosis.left_out < diagnosis.sessions:
+        logs.remarks.append(
+            f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
+            "propensity: estimates that weigh leave these sessions out"
+        )
+    warnings = [*verdict.reasons, *logs.remarks]
     judged = logs.columns | diagnosis.list_columns() | verdict.list_columns()
     judged |= {"warnings": warnings}
     record = trained.record

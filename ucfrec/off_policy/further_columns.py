@@ -8,10 +8,10 @@ from typing import Final
 
 import duckdb
 import numpy as np
+import pandas as pd
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array, IntArray
-from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.engine import bind, engine, explain_errors, text_of_column
@@ -71,15 +71,24 @@ def read_groups(
     inputs = [*files, *(file for part in parts for file in log_files(part.files))]
     with engine(inputs, folder, options.memory_limit) as connection:
         for key, tables in _find_tables(connection, files, mapping, options, column):
-            values = dict[str, str]()
             with explain_errors(connection, [table for table, _ in tables]):
-                rows = [_read_values(connection, *table, key, column) for table in tables]
-            for row in (row for part in rows for row in part):
-                if row[2] > 1 or values.setdefault(row[0], row[1]) != row[1]:
-                    break
-            else:
-                return _group_steps(column, values, *ids[key], key == schema.ITEM_ID)
-    raise InputError(f"{files[0]}: --by {column}: a user, and an item, has several values of it")
+                pairs = [_read_values(connection, *table, key, column) for table in tables]
+            values = pd.concat(pairs).drop_duplicates()
+            if values["id"].is_unique:
+                break
+        else:
+            raise InputError(f"{files[0]}: --by {column}: users and items have several values")
+    known, (listed, place) = values.set_index("id")["value"], ids[key]
+    texts = pd.Series(listed.tolist(), dtype=object).astype(str)
+    names = texts.map(known).reindex(place)
+    sizes = names.value_counts()
+    if not 0 < len(sizes) <= MOST_GROUPS:
+        raise InputError(
+            f"--by {column} has {len(sizes):,} values in these logs; name a column of 1 to "
+            f"{MOST_GROUPS} values"
+        )
+    number = pd.Categorical(names, categories=sizes.index).codes.astype(np.int64)
+    return Groups(tuple(sizes.index), number, key == schema.ITEM_ID)
 
 
 def _find_tables(
@@ -106,34 +115,11 @@ def _find_tables(
 
 def _read_values(
     connection: duckdb.DuckDBPyConnection, table: Table, id_: str, key: str, column: str
-) -> list[tuple[str, str, int]]:
-    """Each id with a value of the column, and how many values it has."""
+) -> pd.DataFrame:
+    """The different pairs of an id and a value of the column, as texts."""
     named, by = bind(connection, table, key, id_), bind(connection, table, "--by", column)
     texts = named.columns if named.is_column else ()
     text = table.text_of(texts[0]) if texts else f"CAST({named.sql} AS VARCHAR)"
     source = table.with_texts([*named.columns, *by.columns], texts).sql
-    value = f"CAST({by.sql} AS VARCHAR)"
-    return connection.execute(
-        f"SELECT {text} AS id, min({value}), count(DISTINCT {value}) FROM {source} "
-        f"WHERE {text} IS NOT NULL AND {value} IS NOT NULL GROUP BY id"
-    ).fetchall()
-
-
-def _group_steps(
-    column: str, values: dict[str, str], ids: Array, place: IntArray, of_items: bool
-) -> Groups:
-    """The groups of steps, at a place each in the ids (n,), the largest first."""
-    of_id, lookup = np.full(len(ids) + 1, -1), IdLookup(ids).numbers(np.array([*values], object))
-    names, codes = np.unique([*values.values()], return_inverse=True)
-    of_id[lookup[lookup >= 0]] = codes[lookup >= 0]
-    number = of_id[place]
-    sizes = np.bincount(number[number >= 0], minlength=len(names))
-    if not 0 < np.count_nonzero(sizes) <= MOST_GROUPS:
-        raise InputError(
-            f"--by {column} has {np.count_nonzero(sizes):,} values in these logs; name a column of "
-            f"1 to {MOST_GROUPS} values"
-        )
-    order = np.argsort(-sizes, kind="stable")[: np.count_nonzero(sizes)]
-    rank = np.append(np.full(len(names), -1), -1)
-    rank[order] = np.arange(len(order))
-    return Groups(tuple(str(names[code]) for code in order), rank[number], of_items)
+    pairs = f"SELECT DISTINCT {text} AS id, CAST({by.sql} AS VARCHAR) AS value FROM {source}"
+    return connection.execute(f"FROM ({pairs}) WHERE id IS NOT NULL AND value IS NOT NULL").df()

@@ -223,17 +223,6 @@ def identification_bounds(
     return float(supported + worth * low), float(supported + worth * high)
 
 
-def list_cautions(diagnosis: Diagnosis) -> list[str]:
-    """What to know of an estimate that may stand all the same."""
-    cautions = []
-    if 0 < diagnosis.left_out < diagnosis.sessions:
-        cautions.append(
-            f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
-            "propensity: estimates that weigh leave these sessions out"
-        )
-    return cautions
-
-
 def list_reasons(diagnosis: Diagnosis) -> list[str]:
     """What forbids a conclusion, the gravest first."""
     if diagnosis.left_out == diagnosis.sessions:

@@ -39,10 +39,10 @@ import numpy as np
 from measured_rows import make_parser
 
 from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.off_policy.answer import conclude
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.models import fit_models
-from ucfrec.off_policy.verdict import conclude
 from ucfrec.processes import progress
 from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, append_rows
@@ -168,13 +168,13 @@ def replication(environment: Environment, seed: int) -> Replication:
     steps, (truth, as_logged) = environment.logged(seed), environment.value(seed)
     verdict, found = conclude(steps, seed), estimate(steps, seed)
     intervals = {name: (one.low, one.high, truth) for name, one in found.items()}
-    intervals["lift"] = (verdict.lift_low, verdict.lift_high, truth - as_logged)
+    intervals["lift"] = (verdict.lift.low, verdict.lift.high, truth - as_logged)
     if "logged" in found:
         intervals["logged"] = (found["logged"].low, found["logged"].high, as_logged)
     holds = dict.fromkeys(SHOWN, False)
     for name, (low, high, value) in intervals.items():
         holds[name] = low is not None and high is not None and low <= value <= high
-    return Replication(verdict.reliable, holds)
+    return Replication(verdict.lift.is_reliable, holds)
 
 
 class Coverage:

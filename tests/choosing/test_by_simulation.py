@@ -21,7 +21,7 @@ from ucfrec.choosing.by_simulation import (
     choose_by_simulation,
     find_neighbours,
 )
-from ucfrec.choosing.choice import Evidence, Problem, RuleChoice, RuleConfig
+from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig, RuleEvidence
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -150,8 +150,8 @@ def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> No
     # Of these, the simplest: the higher temperature, whatever comes first.
     assert search.best([low, high]) == search.best([high, low]) == high
     # Or the one that the log says most of: the likelihood, then the hits.
-    likely = replace(low, evidence=Evidence(0.1, 0.2))
-    unlikely, hitting = (replace(high, evidence=Evidence(0.3, each)) for each in (0.1, 0.2))
+    likely = replace(low, evidence=RuleEvidence(0.1, 0.2))
+    unlikely, hitting = (replace(high, evidence=RuleEvidence(0.3, each)) for each in (0.1, 0.2))
     assert search.most_evident([unlikely, likely]) == likely
     assert search.most_evident([likely, hitting]) == hitting
 

@@ -14,9 +14,9 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import prepare
+from ucfrec.off_policy import conclude, diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.verdict import conclude, diagnose
 from ucfrec_datasets.obd import DATASET
 
 ITEMS, POSITIONS, ROWS = 6, 3, 400
@@ -153,5 +153,5 @@ def test_random_logs_tell_what_thompson_sampling_earns() -> None:
     assert 1000 < found["IPS"].effective_sessions < 5000
     assert diagnose(steps).overlap == pytest.approx(1, abs=0.05)
     verdict = conclude(steps, seed=0)
-    assert verdict.reliable
-    assert verdict.lift_low < earned.mean() - random.click.mean() < verdict.lift_high
+    assert verdict.lift.is_reliable
+    assert verdict.lift.low < earned.mean() - random.click.mean() < verdict.lift.high

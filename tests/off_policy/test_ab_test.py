@@ -13,7 +13,7 @@ from scipy.stats import chisquare
 
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.off_policy.ab_test import always_valid, compare_arms
+from ucfrec.off_policy.ab_test import MISMATCH, Comparison, always_valid, compare_arms
 
 
 def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFrame:
@@ -26,6 +26,9 @@ def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFr
     return pd.DataFrame({"user_id": user.astype(str), "arm": arm, "feedback": clicks})
 
 
+SHARES = {"a": 0.8, "b": 0.2}
+
+
 def test_a_planted_difference_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log(4000, 0.4).to_parquet(tmp_path / "log.parquet")
     arguments = ["compare", str(tmp_path / "log.parquet"), "--expected", "0.05"]
@@ -33,10 +36,9 @@ def test_a_planted_difference_is_found(tmp_path: Path, capsys: pytest.CaptureFix
     assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["arms"] == ["a", "b"]
-    assert found["low"] < 0.2 * 0.4 < found["high"]
-    assert found["always_low"] < found["low"]
-    assert found["always_low"] > 0
-    assert "b is better than a" in capsys.readouterr().out
+    assert found["planned"]["low"] < 0.2 * 0.4 < found["planned"]["high"]
+    assert 0 < found["always"]["low"] < found["planned"]["low"]
+    assert capsys.readouterr().out.startswith("b is better than a\n")
 
 
 @pytest.mark.parametrize(
@@ -58,17 +60,17 @@ def test_users_that_do_not_differ_or_are_few_decide_nothing(
     arguments = ["compare", str(tmp_path / "log.parquet"), "--arms", "a,b"]
     assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
-    assert [found[name] for name in ("low", "high", "always_low", "always_high")] == [None] * 4
+    assert {found[name][end] for name in ("planned", "always") for end in ("low", "high")} == {None}
     said = capsys.readouterr().out
-    assert "[unknown, unknown] at a planned end" in said
-    assert "nothing can be said yet" in said
+    assert "b − a: – at a planned end; – always valid" in said
+    assert said.startswith("nothing can be concluded: a")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"arm": "a"}, r"two arms .* 'a' \(50 users\)"),
-        ({"feedback": "x"}, "not a number"),
+        ({"feedback": "x"}, "is VARCHAR; name a column of numbers"),
         ({"arm": None}, "two arms .* none"),
         ({"feedback": np.nan}, r"value of feedback .* 'a' \(0 users\), 'b' \(0 users\)"),
         ({"feedback": np.inf}, r"log\.parquet: feedback is infinite .* in 500 rows"),
@@ -79,7 +81,7 @@ def test_what_has_no_two_arms(tmp_path: Path, change: dict[str, str], message: s
     with pytest.raises(InputError, match=message):
         compare_arms([tmp_path / "log.parquet"])
     log(50, 0.0).to_parquet(tmp_path / "log.parquet")
-    with pytest.raises(InputError, match=r"no column clicks; .*of numbers are feedback"):
+    with pytest.raises(InputError, match=r"no column 'clicks'"):
         compare_arms([tmp_path / "log.parquet"], "clicks")
 
 
@@ -96,15 +98,17 @@ def test_rows_without_a_value(
     table = pa.Table.from_pandas(frame.drop(columns="feedback"), preserve_index=False)
     pq.write_table(table.append_column("feedback", column), tmp_path / "log.parquet")
     kept.to_parquet(tmp_path / "kept.parquet")
-    expected = compare_arms([tmp_path / "kept.parquet"])
-    assert main(["compare", str(tmp_path / "log.parquet"), "--json", str(tmp_path / "o.json")]) == 0
+    expected = compare_arms([tmp_path / "kept.parquet"], shares=SHARES)
+    arguments = ["compare", str(tmp_path / "log.parquet"), "--shares", "a=0.8,b=0.2"]
+    assert main([*arguments, "--json", str(tmp_path / "o.json")]) == 0
     of_a, of_b = (int((lacks & (frame.arm == arm)).sum()) for arm in "ab")
     said = f"log.parquet: feedback has no value in {of_a} rows of a and {of_b} of b"
     assert said in capsys.readouterr().err
     found = json.loads((tmp_path / "o.json").read_text())
     assert found["without_value"] == [of_a, of_b]
-    for name in ("values", "users", "rows", "difference", "error", "always_low"):
+    for name in ("values", "users", "rows"):
         assert found[name] == pytest.approx(getattr(expected, name)), name
+    assert found["always"]["low"] == pytest.approx(expected.always.low)
 
 
 def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
@@ -121,12 +125,15 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     # Rows of one user count as one, and users of several arms not at all.
     both = frame[frame.user_id == "1"].assign(arm="b")
     pd.concat([frame] * 4).to_parquet(tmp_path / "log.parquet")
-    assert compare_arms([tmp_path / "log.parquet"]).error == pytest.approx(once.error)
+    again = compare_arms([tmp_path / "log.parquet"], shares=SHARES).planned
+    once = compare_arms([tmp_path / "kept.parquet"], shares=SHARES).planned
+    assert again.low == pytest.approx(once.low)
     pd.concat([frame, both]).to_parquet(tmp_path / "log.parquet")
     found = compare_arms([tmp_path / "log.parquet"])
-    assert (found.in_several, found.users) == (1, (159, 40))
+    assert (found.in_several, found.named, found.users) == (1, ("1",), (159, 40))
+    assert "1 users were in more than one arm (1); their rows are left out" in str(found)
     named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
-    assert named.difference == pytest.approx(-found.difference)
+    assert named.planned.value == pytest.approx(-found.planned.value)
 
 
 def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
@@ -147,6 +154,44 @@ def test_arms_and_values_of_any_type_are_the_same(tmp_path: Path, kind: str) -> 
     typed.to_parquet(tmp_path / "typed.parquet")
     found = compare_arms([tmp_path / "typed.parquet"])
     assert replace(found, arms=("a", "b")) == expected
+
+
+def test_guardrails_and_groups_are_compared(tmp_path: Path) -> None:
+    file, shares = tmp_path / "log.parquet", SHARES
+    frame = log(5000, 0.5)
+    phone = frame.index % 10 < 4
+    b = frame.arm == "b"
+    # Dwell falls by a tenth; the gain is on phones only.
+    frame["dwell"] = np.random.default_rng(1).exponential(10, len(frame)) * np.where(b, 0.9, 1)
+    frame["device"] = np.where(phone, "phone", "web")
+    lost = b & ~phone & (np.random.default_rng(2).random(len(frame)) < 1 / 3)
+    frame.loc[lost, "feedback"] = 0
+    frame.to_parquet(file)
+
+    def compare(*guardrails: str) -> Comparison:
+        return compare_arms([file], shares=shares, guardrails=guardrails, by="device")
+
+    phones, web = compare("dwell >= -20%").groups
+    assert (phones.name, phones.users, web.name) == ("phone", 5000, "web")
+    assert phones.difference.standing() == "better"
+    assert web.difference.low < 0 < web.difference.high
+    # The interval of a group is that of its rows, wider as there are two.
+    frame[phone].to_parquet(tmp_path / "phone.parquet")
+    alone = compare_arms([tmp_path / "phone.parquet"], shares=shares).always
+    assert phones.difference.value == pytest.approx(alone.value)
+    assert phones.difference.low < alone.low
+    for guardrail, outcome, says in (
+        ("dwell >= -20%", "holds", "b is better than a"),
+        ("2 * dwell >= -5%", "broken", "b is better than a, but a guardrail is broken"),
+        ("dwell >= -10%", "open", "b is better than a, but a guardrail is open"),
+    ):
+        found = compare(guardrail)
+        assert found.guardrails[0].outcome == outcome
+        assert found.guardrails[0].change.low < -0.1 < found.guardrails[0].change.high
+        assert found.conclusion == says
+    mismatched = compare_arms([file], guardrails=["dwell >= -20%"], by="device")
+    assert "guardrail dwell: –, at least -20.0%: open (sample" in str(mismatched)
+    assert all("–" in str(group) for group in mismatched.groups)
 
 
 def test_looking_every_day_finds_a_difference_that_is_not_there_in_few_tests() -> None:
@@ -173,14 +218,15 @@ def test_arms_that_lack_users_conclude_nothing(tmp_path: Path) -> None:
     as_drawn = compare_arms([file], shares={"a": 0.4, "b": 0.1, "c": 0.5})
     expected = chisquare(as_drawn.in_arm, [4000, 1000]).pvalue
     assert as_drawn.split_p_value == pytest.approx(expected)
-    assert not as_drawn.is_mismatched
+    assert as_drawn.always.standing() == "better"
     even = compare_arms([file])
     assert even.split_p_value == pytest.approx(chisquare(even.in_arm).pvalue)
     assert "80.0% and 20.0%, where 50.0% and 50.0% were intended (p = 0)" in str(even)
-    assert even.conclusion.startswith("nothing can be concluded")
+    assert even.conclusion.startswith("nothing can be concluded: sample ratio mismatch")
+    assert "b − a: – at a planned end" in str(even)
     for users, is_mismatched in ((120, False), (145, False), (160, True)):
         few = replace(even, in_arm=(users, 100))
         assert few.split_p_value == pytest.approx(chisquare(few.in_arm).pvalue)
-        assert few.is_mismatched is is_mismatched
+        assert (few.split_p_value < MISMATCH) is is_mismatched
     with pytest.raises(InputError, match="shares are given of a, c; the arms are"):
         compare_arms([file], shares={"a": 0.5, "c": 0.5})

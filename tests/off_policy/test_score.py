@@ -233,7 +233,7 @@ def test_the_share_of_rows_seen_in_training(
     with read(train, keep=True) as logged:
         rule = DecisionRule(5.0, temperature=1.0)
         evaluated = evaluate_off_policy(trained, logged, rule=rule, seed=0)
-    assert not evaluated.verdict.reliable
+    assert not evaluated.verdict.lift.is_reliable
     assert "90% of the rows were seen in training" in evaluated.verdict.reasons[0]
     assert evaluated.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
 

@@ -10,6 +10,7 @@ from tests.support.killed import kills
 from tests.support.served import trained_run
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
+from ucfrec.results.evidence import Evidence
 from ucfrec.runs.promoted import POINTER, promote, promote_back, promoted
 from ucfrec.runs.record import RunRecord, Update
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -26,10 +27,10 @@ def runs(trained: TrainedPolicy, folder: Path, *names: str) -> Path:
     return folder
 
 
-def updated(run: Path, of: TrainedPolicy, result: str) -> Path:
-    """Give a run a verdict against another one."""
-    difference = {"measure": "ndcg_liked", "value": 0.1, "low": 0.0, "high": 0.2}
-    verdict = {"result": result, "decided_by": "x", "differences": [difference], "steps": 9}
+def updated(run: Path, of: TrainedPolicy, low: float, high: float = 0.2) -> Path:
+    """Give a run a verdict against another one: level by the deciding measure, and by a second."""
+    differences = {"x": Evidence(0.0, 0.0, 0.0), "ndcg_liked": Evidence(low, low, high)}
+    verdict = {"decided_by": "x", "differences": differences, "steps": 9}
     about = {"of": "a", "run": of.fingerprint, "settings_from_nothing": {}, "appended": {}}
     update = Update.model_validate({**about, "episodes": 1, "verdict": verdict | {"users": 3}})
     RunRecord.read(run).copy_with(update=update).write(run)
@@ -47,10 +48,10 @@ def test_a_first_run_needs_no_verdict_and_later_ones_do(
     promote(folder / "a")
     with pytest.raises(InputError, match="no verdict"):
         promote(folder / "b")
-    with pytest.raises(InputError, match="worse than a"):
-        promote(updated(folder / "b", trained, "worse"))
+    with pytest.raises(InputError, match=r"worse than a: ndcg_liked -0.3 \[-0.3, -0.1\]"):
+        promote(updated(folder / "b", trained, -0.3, -0.1))
     assert current(folder) == "a"
-    promote(updated(folder / "b", trained, "no significant difference"))
+    promote(updated(folder / "b", trained, -0.1))
     assert current(folder) == "b"
     promote(folder / "c", force=True)
     promote(folder / "c")  # again: nothing changes
@@ -68,10 +69,10 @@ def test_another_run_under_the_name_of_the_current_one_needs_a_verdict(
         promote(folder / "a")
     for name in ("a", "b"):
         with pytest.raises(InputError, match="was compared with a, not with the current run a"):
-            promote(updated(folder / name, trained, "better"))
+            promote(updated(folder / name, trained, 0.1))
     told = "a is not the run that was promoted"
     with pytest.raises(InputError, match=told):
-        promote(updated(folder / "b", TrainedPolicy.load(folder / "a"), "better"))
+        promote(updated(folder / "b", TrainedPolicy.load(folder / "a"), 0.1))
     assert main(["update", str(folder), "log.parquet", "--out", str(tmp_path / "c")]) == 2
     assert told in capsys.readouterr().err
     found = promote(folder / "a", force=True)

@@ -1,5 +1,6 @@
 """An updated run knows the new rows, starts from the old weights, and says how it compares."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None
     log = later_log(propensity=True)
     assert update.drift["unknown_items"] == pytest.approx((log.item_id >= ITEMS).mean())
     assert update.drift["observed"] == pytest.approx(log.reward[log.item_id < ITEMS].mean())
-    measures = {each.measure for each in update.verdict.differences}
+    measures = {*update.verdict.differences}
     assert measures == {"ndcg_liked", "reward per step"}
     assert update.verdict.steps == 60
     assert record.finished.steps < old.record.finished.steps
@@ -65,7 +66,10 @@ def test_an_update_of_an_update_has_the_settings_of_the_first_run(folder: Path) 
     third = update_run(folder / "run2", logs, folder / "run3", mapping=mapping)
     second = RunRecord.read(folder / "run2")
     assert third.update.settings_from_nothing == second.update.settings_from_nothing
-    assert third.config == second.config
+    assert replace(third.config, rule=second.config.rule) == second.config
+    # The second run draws its items, and so does its update.
+    assert min(second.config.rule.temperatures) == 0 < second.rule.rule.temperature
+    assert min(third.config.rule.temperatures) > 0 < third.rule.rule.temperature
 
 
 def test_the_same_command_goes_on_and_another_is_refused(

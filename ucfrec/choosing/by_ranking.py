@@ -17,7 +17,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice, RuleRecord
+from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleEvidence, RuleRecord
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
@@ -109,7 +109,7 @@ class LoggedEvidence:
         self._users = np.unique(number_users(view), return_inverse=True)[1]
         self.n_users = int(self._users.max(initial=-1)) + 1
 
-    def evaluate(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
+    def evaluate(self, rules: Sequence[DecisionRule]) -> list[RuleEvidence]:
         """The evidence of each rule."""
         shape = len(rules), len(self._logged.steps)
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
@@ -121,24 +121,24 @@ class LoggedEvidence:
             hits[n, part] = (top == items[part]).any(1).numpy()
         return [self._weigh(logs[n], hits[n]) for n in range(len(rules))]
 
-    def _weigh(self, logs: Float64Array, hits: BoolArray) -> Evidence:
+    def _weigh(self, logs: Float64Array, hits: BoolArray) -> RuleEvidence:
         liked, view = self._logged.liked, self._logged.view
         rate = float(hits[liked].mean()) if liked.any() else 0.0
         likelihood = float(np.exp(logs.mean()))
         if self.propensities is None:
-            return Evidence(rate, likelihood)
+            return RuleEvidence(rate, likelihood)
         sums = np.bincount(self._logged.episodes, logs - np.log(self.propensities))
         weights = np.exp(np.minimum(sums, 100.0))
         above = np.bincount(self._users, weights * view.returns).astype(np.float64)
         below = np.bincount(self._users, weights).astype(np.float64)
         if not below.any():
-            return Evidence(rate, likelihood, 0.0)
+            return RuleEvidence(rate, likelihood, 0.0)
         halves = [half for half in (below[::2], below[1::2]) if len(half)]
         effective_users = 2 * min(effective_number(half) for half in halves)
         spread = float(sums[np.isfinite(sums)].var())
         value = above.sum() / below.sum()
         error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return Evidence(rate, likelihood, effective_users, spread, value, error)
+        return RuleEvidence(rate, likelihood, effective_users, spread, value, error)
 
 
 def choose_by_ranking(problem: Problem) -> RuleChoice:

@@ -89,7 +89,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class RuleEvidence:
     """What validation sessions show of a rule without any model of the users."""
 
     hits: float
@@ -124,7 +124,7 @@ class SimulatedRule:
     support: float
     """Share of decisions on items that the log supports."""
     items: float
-    evidence: Evidence | None = None
+    evidence: RuleEvidence | None = None
     """What validation sessions show of it; None if no one looked."""
 
     @property

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Selection
-    from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.rows import Ranking, ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -37,10 +36,7 @@ class Ope(RuleOptions, LogOptions):
 
     described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
     usage = "%(prog)s RUN... [LOGS...] [options]"
-    epilog = (
-        "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
-        "targets or rules are ranked, with a band that holds all at once."
-    )
+    epilog = "Without LOGS, from the test split. Several runs, targets or rules are ranked."
 
     targets: Annotated[str | None, "RETURN,…"] = None
     """Compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1"""
@@ -53,12 +49,18 @@ class Ope(RuleOptions, LogOptions):
     """Of the folds and the bootstrap."""
     json: Path | None = None
     """Write the result rows here."""
+    details: bool = False
+    """Also print all estimates, and what was read."""
     discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
     pages: Annotated[bool, _ESTIMATED] = False
     reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return"""
+    guardrail: Annotated[Sequence[str], _ESTIMATED, "MEASURE"] = ()
+    """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%', an expression
+    over the columns of LOGS; repeatable; a launch needs every one"""
+    by: Annotated[str | None, _ESTIMATED, "COLUMN"] = None
     item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
     estimate_propensities: Annotated[bool, _ESTIMATED] = False
     anonymous: Annotated[bool, _ESTIMATED] = False
@@ -68,6 +70,7 @@ class Ope(RuleOptions, LogOptions):
         """Print the estimates and the verdict of every candidate."""
         from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy import evaluate
+        from ucfrec.off_policy.answer import MOST_LINES
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
         from ucfrec.results.rows import write_results
@@ -76,7 +79,8 @@ class Ope(RuleOptions, LogOptions):
         settings = settings_given(self, evaluate.EstimateOptions)
         if self.lift is not None:
             settings["wanted_lift"] = self.lift
-        options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
+        settings |= {"users_known": not self.anonymous, "guardrails": tuple(self.guardrail)}
+        options = evaluate.EstimateOptions(**settings)
         if self.scored and not logs:
             raise InputError("--scored needs what ucfrec score wrote; name it after the run")
         # On the test split, the weights that have not learned from it.
@@ -90,21 +94,20 @@ class Ope(RuleOptions, LogOptions):
             ]
         )
         reports: dict[str, OffPolicyReport] = {}
+        details: list[str] = []
         for policy, rules in candidates:
             reading: AbstractContextManager[LoggedSessions | None] = nullcontext()
             if not self.scored:
-                reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+                reading = self.read_sessions([policy], logs, self.json, True, options)
             with reading as logged:
                 if logged is not None and logs:
-                    print(format_summary(logged.report))
+                    details.append(format_summary(logged.report))
                 elif logged is not None:
                     store = logged.store
                     sizes = f"{store.n_episodes:,} sessions, {store.n_steps:,} steps"
-                    print(f"test split of {store.path}: {sizes}")
+                    details.append(f"test split of {store.path}: {sizes}")
                 for rule in rules:
                     name = names[len(reports)]
-                    if len(names) > 1:
-                        print(f"\n{name}:")
                     reports[name] = estimate_return(
                         (policy, rule),
                         [Path(log) for log in logs] if logged is None else logged,
@@ -113,10 +116,17 @@ class Ope(RuleOptions, LogOptions):
                         seed=self.seed,
                         checkpoint=self.checkpoint,
                     )
-                    print(_describe(reports[name]))
+                    details.append(_describe(name, reports[name]))
         choice = choose(reports, self.seed) if len(reports) > 1 else None
-        if choice is not None:
-            print(_describe_choice(choice))
+        if choice is None:
+            most = None if self.details else MOST_LINES
+            print("\n".join(reports[names[0]].list_lines(most)))
+        else:
+            print(f"choice: {choice.headline}")
+            print("\n".join(f"{name}: {report.verdict}" for name, report in reports.items()))
+            details.append(_describe_choice(choice))
+        if self.details:
+            print("\n\n".join(["", *details]))
         rows = []
         for name, report in reports.items():
             columns = {"candidate": name} | (choice.columns(name) if choice else {})
@@ -143,29 +153,36 @@ class Ope(RuleOptions, LogOptions):
         return list({rule.hash: rule for rule in rules}.values())
 
 
-def _describe(report: "OffPolicyReport") -> str:
-    """The estimates, what to know of them, the verdict and what to do next."""
-    lines = ["", _table(report.rows, ("R_cum", "effective_sessions", "sessions"))]
-    if report.per_step is not None:
-        columns = ("R_step", "effective_steps", "steps")
-        table = _table(report.step_rows, columns, steps=report.per_step.steps)
-        lines += ["", table, f"{report.per_step}", ""]
-    lines.append("R_cum: return per session, with a 95% interval where an estimator has one")
+def _describe(name: str, report: "OffPolicyReport") -> str:
+    """The estimates, the reasons against some of them, and what to know of the logs."""
+    lines = [f"{name}:", _table(report.rows, ("R_cum", "effective_sessions", "sessions"))]
+    if report.step_rows:
+        table = _table(report.step_rows, ("R_step", "effective_steps"))
+        lines += ["", table, "R_step: mean reward of a step, after histories as logged", ""]
+    lines.append("R_cum: return per session, with a 95% interval; – where a reason forbids it:")
+    reasons: dict[str, list[str]] = {reason: [] for reason in report.verdict.reasons}
+    for row in report.rows:
+        for reason in row.details.get("reasons", ()):
+            reasons.setdefault(reason, []).append(row.method)
+    lines += [
+        f"  {', '.join(methods) or 'sessions'}: {reason}" for reason, methods in reasons.items()
+    ]
     if report.models is not None:
         lines.append(f"models: {report.models}")
-    lines += [f"warning: {warning}" for warning in report.warnings]
-    lines += [f"verdict: {report.verdict.headline}", _next_step(report.verdict)]
     return "\n".join(lines)
 
 
-def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object) -> str:
-    """The rows of estimators, with the columns and what is the same in all of them."""
+def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...]) -> str:
+    """The rows of estimators, with the columns and what is the same in all of them; without the
+    numbers that a reason speaks against."""
     from ucfrec.reporting.tables import format_rows
 
-    columns = ("estimator", "policy", "choice", *columns)
-    lines = [
-        {**dict.fromkeys(columns), **row.as_line(), "estimator": row.method, **more} for row in rows
-    ]
+    columns, lines = ("estimator", "policy", "choice", *columns), []
+    for row in rows:
+        numbers = ("", "_low", "_high") if row.details.get("reasons") else ()
+        doubtful = {f"{row.metric}{end}": None for end in numbers}
+        line = {**dict.fromkeys(columns), **row.as_line(), **doubtful}
+        lines.append({**line, "estimator": row.method})
     return format_rows(lines, columns)
 
 
@@ -173,32 +190,20 @@ def _describe_choice(choice: "Selection") -> str:
     """The candidates in order, and which comes first."""
     from ucfrec.reporting.tables import text_table
 
-    lines = []
-    if choice.standings:
-        rows = [
-            (
-                standing.name,
-                f"{standing.value:.4g} [{standing.low:.4g}, {standing.high:.4g}]",
-                f"{standing.probability_best:.2f}",
-                str(standing.rank),
-            )
-            for standing in choice.standings
-        ]
-        lines.append("\nvalue per session, with a 95% band that holds all of them at once:")
+    rows = [
+        (
+            standing.name,
+            f"{standing.value:.4g} [{standing.low:.4g}, {standing.high:.4g}]",
+            f"{standing.probability_best:.2f}",
+            str(standing.rank),
+        )
+        for standing in choice.standings
+    ]
+    lines = [f"not ranked: {name}: {reasons}" for name, reasons in choice.excluded.items()]
+    if rows:
+        lines.append("value per session, with a 95% band that holds all of them at once:")
         lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))
-    lines += [f"not ranked: {name}: {reasons}" for name, reasons in choice.excluded.items()]
-    return "\n".join([*lines, f"choice: {choice.headline}"])
-
-
-def _next_step(verdict: "Verdict") -> str:
-    """What to do about a verdict, in a line."""
-    if not verdict.reliable or verdict.lift_low is None or verdict.lift_high is None:
-        return "next: do not launch on this; remedy the warnings, or log more sessions at random"
-    if verdict.lift_low > 0:
-        return "next: test the policy on a share of the users, then compare with this estimate"
-    if verdict.lift_high < 0:
-        return "next: do not launch this policy; compare other ones, or other --targets"
-    return "next: log more sessions, or compare other policies, --targets or --temperatures"
+    return "\n".join(lines)
 
 
 def _read_target(part: str, trained: "TrainedPolicy") -> float:

@@ -164,6 +164,7 @@ class Update(LogOptions, RunArgument):
     no_refit: bool = False
     """Once the runs are compared, do not go on learning from the validation and test rows;
     (default: RUN2 acts by the weights that learned from all rows)"""
+    allow_argmax: bool = False
 
     def execute(self) -> None:
         """Print what was read, the drift and the verdict."""
@@ -187,7 +188,7 @@ class Update(LogOptions, RunArgument):
             split=parse_split(self.split) if self.split else SPLIT,
             memory_limit=self.memory_limit,
         )
-        options = UpdateOptions(append, refit=not self.no_refit)
+        options = UpdateOptions(append, refit=not self.no_refit, allow_argmax=self.allow_argmax)
         record = update_run(
             run, files, self.out, store=self.store, mapping=mapping, options=options
         )
@@ -208,8 +209,8 @@ class Update(LogOptions, RunArgument):
             print(f"rule changed  {old.rule} → {record.rule.rule}")
         print(f"{describe_drift(update.drift)}\n{describe(update.verdict)}")
         print(f"\nrun: {self.out}")
-        if update.verdict.result == "worse":
-            print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
+        if harms := update.verdict.harms:
+            print(f"next: keep the old run, as the new one is worse: {harms}")
         else:
             print(f"next: ucfrec promote {quote(str(self.out))}, if `serve` follows its folder")
 
@@ -228,6 +229,11 @@ class Compare(Table):
     test (default: 5% of the value of A)"""
     shares: Annotated[str | None, "A=SHARE,B=SHARE"] = None
     """Shares of the users that were intended for the arms, as of serve --split (default: equal)"""
+    guardrail: Annotated[Sequence[str], "MEASURE"] = ()
+    """Least (or largest) change of B in a measure, in percent, e.g. 'dwell_seconds >= -2%';
+    repeatable"""
+    by: Annotated[str | None, "COLUMN"] = None
+    """Also compare within groups of the rows, by a column or expression."""
     json: Path | None = None
     """Also write the numbers as JSON."""
     memory_limit: str = "2GB"
@@ -246,9 +252,16 @@ class Compare(Table):
             raise InputError(f"--expected is {self.expected}; give a difference above 0")
         shares = parse_split(self.shares) if self.shares else None
         result = compare_arms(
-            self.logs, self.column, arms, self.expected, shares, self.memory_limit
+            self.logs,
+            self.column,
+            arms,
+            self.expected,
+            shares,
+            self.memory_limit,
+            self.guardrail,
+            self.by,
         )
-        print(f"{result}\n\n{result.conclusion}")
+        print(result)
         if self.json:
             write_json(self.json, asdict(result))
 

@@ -13,6 +13,7 @@ from ucfrec.files.atomic import require_other_files
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.off_policy.evaluate import EstimateOptions
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -92,15 +93,24 @@ class LogOptions(Table):
         logs: Sequence[str],
         output: Path | None,
         keep_unknown: bool = False,
+        options: "EstimateOptions | None" = None,
     ) -> "AbstractContextManager[LoggedSessions]":
-        """Sessions of logs, read as the first policy was trained; those of the test split of the
-        policies' store if no logs are named."""
+        """Sessions of logs, read as the first policy was trained, with what the options of an
+        estimate need; those of the test split of the policies' store if no logs are named."""
         from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
 
         if not logs:
             return nullcontext(held_out_sessions(policies))
         files, mapping = self.find_logs(logs, policies[0], [output])
-        return read_logged_sessions(policies[0], files, mapping, keep_unknown, self.memory_limit)
+        return read_logged_sessions(
+            policies[0],
+            files,
+            mapping,
+            keep_unknown,
+            self.memory_limit,
+            measures=options.measures if options else (),
+            by=options.by if options else None,
+        )
 
 
 class SparkOption(Table):

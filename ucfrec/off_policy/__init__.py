@@ -9,10 +9,11 @@ The array functions need no ucfrec run, and do not load torch:
         print(name, one.value, one.low, one.high)
 """
 
+from ucfrec.off_policy.answer import Verdict, conclude
 from ucfrec.off_policy.estimators import Estimate, estimate
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled, as_pages
 from ucfrec.off_policy.selection import select
-from ucfrec.off_policy.verdict import Verdict, conclude, diagnose
+from ucfrec.off_policy.verdict import diagnose
 
 __all__ = [
     "Estimate",

@@ -3,8 +3,9 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import NormalDist
 from tempfile import gettempdir
 from typing import Final
 
@@ -13,20 +14,24 @@ import pandas as pd
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import scratch_folder
-from ucfrec.logs.engine import engine, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors, wrong_type
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
-from ucfrec.logs.tables import first_and_more, is_number, open_tables, quote_name
+from ucfrec.logs.tables import first_and_more, is_number, open_tables
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
+from ucfrec.off_policy.guardrails import GroupDifference, Guardrail
+from ucfrec.results.evidence import Evidence
 
-_NORMAL = 1.959964
-LEVEL: Final = 0.95
+MISS: Final = 0.05
+"""Probability with which an interval misses the difference."""
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
 MISMATCH: Final = 0.001
 """Below this p-value, the users were not drawn into the arms by the intended shares."""
 _LARGEST = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""
+_NAMED = 3
+"""Most users of several arms that are named."""
 
 
 @dataclass(frozen=True)
@@ -51,84 +56,70 @@ class Comparison:
     """Rows of a user without an arm."""
     in_several: int
     """Users who were in more than one arm."""
-    difference: float
-    """Of the second arm less the first."""
-    error: float
-    """Its standard error, over users."""
-    low: float | None
-    """Ends of the 95% interval, for a test that ends when it was planned to; None, as the others,
-    where an arm has fewer than `FEWEST_USERS` users or all are equal."""
-    high: float | None
-    always_low: float | None
-    """Ends of the 95% interval that may be looked at as often as one likes, and acted upon."""
-    always_high: float | None
+    named: tuple[str, ...]
+    """Some of them."""
+    planned: Evidence
+    """Of the second arm less the first, for a test that ends when it was planned to."""
+    always: Evidence
+    """The same, with an interval that may be looked at as often as one likes, and acted upon."""
+    guardrails: tuple[Guardrail, ...] = ()
+    """Always valid."""
+    groups: tuple[GroupDifference, ...] = ()
+    """Always valid, and for all groups at once."""
 
     def __str__(self) -> str:
-        lines = [
+        lines = [self.conclusion]
+        lines += [
             f"{name}: {value:.4g} {self.column} per shown item; {users:,} users, {rows:,} items"
             for name, value, users, rows in zip(
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
+        names = ", ".join(self.named) + ", …" * (self.in_several > len(self.named))
         left_out = {
             f"rows have no {schema.USER_ID}; they are left out": self.without_user,
             f"rows have no {schema.ARM}; they are left out": self.without_arm,
-            "users were in more than one arm; their rows are left out": self.in_several,
+            f"users were in more than one arm ({names}); their rows are left out": self.in_several,
         }
         lines += [f"{count:,} {text}" for text, count in left_out.items() if count]
-        if self.is_mismatched:
-            (a, b), (first, second) = self.in_arm, self.shares
-            lines.append(
-                f"sample ratio mismatch: {a:,} and {b:,} users, {a / (a + b):.1%} and "
-                f"{b / (a + b):.1%}, where {first:.1%} and {second:.1%} were intended (p = "
-                f"{self.split_p_value:.2g})"
-            )
-        low, high, always_low, always_high = (
-            "unknown" if end is None else f"{end:+.4g}"
-            for end in (self.low, self.high, self.always_low, self.always_high)
-        )
         lines.append(
-            f"{' − '.join(reversed(self.arms))}: {self.difference:+.4g} [{low}, {high}] at a "
-            f"planned end; [{always_low}, {always_high}] always valid"
+            f"{' − '.join(reversed(self.arms))}: {self.planned.format('+.4g')} at a planned end; "
+            f"{self.always.format('+.4g')} always valid"
         )
-        return "\n".join(lines)
+        return "\n".join([*lines, *map(str, self.guardrails), *map(str, self.groups)])
 
     @property
     def split_p_value(self) -> float:
         """Of the χ² test that users were drawn into the arms by the intended shares."""
-        expected = sum(self.in_arm) * self.shares[0]
-        off = (self.in_arm[0] - expected) ** 2 / (expected * self.shares[1])
-        return math.erfc(math.sqrt(off / 2))
-
-    @property
-    def is_mismatched(self) -> bool:
-        """Whether the arms have other shares of the users than intended: a sample ratio mismatch
-        (Fabijan et al., KDD 2019), after which a difference may be one of the users."""
-        return self.split_p_value < MISMATCH
+        return _test_split(self.in_arm, self.shares[0])
 
     @property
     def conclusion(self) -> str:
-        """What the split of the users and the always-valid interval say."""
+        """What the split of the users, the always-valid interval and the guardrails say."""
         first, second = self.arms
-        if self.is_mismatched:
-            return (
-                "nothing can be concluded: users are missing from an arm, or were drawn otherwise; "
-                f"if other shares were intended, name them: --shares {first}=0.9,{second}=0.1"
-            )
-        if self.always_low is None or self.always_high is None:
-            return (
-                f"nothing can be said yet: an arm has fewer than {FEWEST_USERS} users with a "
-                f"value, or {self.column} is the same for all users of an arm"
-            )
-        if self.always_low > 0:
-            return f"{second} is better than {first}"
-        if self.always_high < 0:
-            return f"{second} is worse than {first}"
-        return f"no difference between {first} and {second} is shown so far"
+        if self.always.reasons:
+            return f"nothing can be concluded: {self.always.reasons[0]}"
+        standing = self.always.standing()
+        if standing not in ("better", "worse"):
+            return f"no difference between {first} and {second} is shown so far"
+        says = f"{second} is {standing} than {first}"
+        outcomes = {guardrail.outcome for guardrail in self.guardrails} - {"holds"}
+        if not outcomes or standing == "worse":
+            return says
+        return f"{says}, but a guardrail is {'broken' if 'broken' in outcomes else 'open'}"
 
 
-def always_valid(difference: float, variance: float, expected: float) -> tuple[float, float]:
-    """A confidence sequence: with a probability of 95%, it holds the true difference at all times.
+def _test_split(users: tuple[int, int], share: float) -> float:
+    expected = sum(users) * share
+    off = (users[0] - expected) ** 2 / (expected * (1 - share))
+    return math.erfc(math.sqrt(off / 2))
+
+
+def always_valid(
+    difference: float, variance: float, expected: float, miss: float = MISS
+) -> tuple[float, float]:
+    """A confidence sequence: but for a probability of `miss`, it holds the true difference at all
+    times.
 
     The mixture sequential probability ratio test for normal estimates, inverted (Johari, Koomen,
     Pekelis & Walsh, Always valid inference, Operations Research 2022): the difference is mixed over
@@ -136,9 +127,61 @@ def always_valid(difference: float, variance: float, expected: float) -> tuple[f
     (Waudby-Smith, Arbour, Sinha, Kennedy & Ramdas, Annals of Statistics 2024).
     """
     mixed = variance + expected**2
-    inside = math.log(mixed / variance) - 2 * math.log(1 - LEVEL)
+    inside = math.log(mixed / variance) - 2 * math.log(miss)
     radius = math.sqrt(variance * mixed / expected**2 * inside)
     return difference - radius, difference + radius
+
+
+@dataclass(frozen=True)
+class _Means:
+    """The means of a measure per shown item in two arms, with their errors over users."""
+
+    values: tuple[float, float]
+    errors: tuple[float, float]
+    users: tuple[int, int]
+    rows: tuple[int, int]
+
+    @classmethod
+    def of(cls, arms: Sequence[pd.DataFrame]) -> "_Means":
+        """Of the users with a value in two arms."""
+        means = [
+            cluster_mean((arm["value"] / arm["shown"]).to_numpy(), None, arm["shown"].to_numpy())
+            for arm in arms
+        ]
+        values, errors = zip(*means, strict=True)
+        sizes = [(len(arm), int(arm["shown"].sum())) for arm in arms]
+        users, rows = zip(*sizes, strict=True)
+        return cls(values, errors, users, rows)
+
+    def list_faults(self) -> tuple[str, ...]:
+        """Why there is no interval."""
+        if min(self.users) < FEWEST_USERS:
+            return (f"an arm has fewer than {FEWEST_USERS} users with a value",)
+        return () if min(self.errors) > 0 else ("all users of an arm have the same value",)
+
+    def compare(
+        self, expected: float | None, reasons: Sequence[str] = (), miss: float = MISS
+    ) -> tuple[Evidence, Evidence]:
+        """The difference at a planned end, and always valid."""
+        value, variance = self.values[1] - self.values[0], sum(e**2 for e in self.errors)
+        if faults := (*reasons, *self.list_faults()):
+            unknown = Evidence(value, None, None, faults)
+            return unknown, unknown
+        error = math.sqrt(variance)
+        half = NormalDist().inv_cdf(1 - miss / 2) * error
+        mixture = expected or EXPECTED * abs(self.values[0]) or error
+        ends = always_valid(value, variance, mixture, miss)
+        return Evidence(value, value - half, value + half), Evidence(value, *ends)
+
+    def check(self, guardrail: Guardrail, reasons: Sequence[str]) -> Guardrail:
+        """The change of the second arm, as a share of the first."""
+        (a, b), (error_a, error_b) = self.values, self.errors
+        faults = (*reasons, *self.list_faults(), *(["its mean is not above 0"] if a <= 0 else []))
+        if faults:
+            return replace(guardrail, change=Evidence(None, None, None, faults))
+        variance = (error_b / a) ** 2 + (b * error_a / a**2) ** 2
+        ends = always_valid(b / a - 1, variance, EXPECTED)
+        return replace(guardrail, change=Evidence(b / a - 1, *ends))
 
 
 def compare_arms(
@@ -148,12 +191,15 @@ def compare_arms(
     expected: float | None = None,
     shares: Mapping[str, float] | None = None,
     memory_limit: str = "2GB",
+    guardrails: Sequence[str] = (),
+    by: str | None = None,
 ) -> Comparison:
     """Compare two arms, or the two that there are, most users first, in logs of `ucfrec join`.
     Users are drawn into arms, so they are clusters. Rows without a value are left out, with an
     `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
     beforehand; None for 5% of the first arm's value. `shares` of the users were intended for the
-    arms, by name; None for equal ones.
+    arms, by name; None for equal ones. `guardrails` are as `dwell_seconds >= -2%`; `by` is a column
+    or expression to show the difference by.
 
     Raises:
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
@@ -163,14 +209,7 @@ def compare_arms(
     name = first_and_more(files)
     groups = _sum_by_user(files, column, memory_limit)
     has_user, has_arm = groups["who"], groups[schema.ARM] != ""
-    if beyond := int(groups["beyond"].sum()):
-        raise InputError(
-            f"{name}: {column} is infinite or beyond ±{_LARGEST:g} in {beyond:,} rows; correct the "
-            "values, or remove them to leave the rows out"
-        )
-    counts = has_user & has_arm & (groups["arms"] == 1)
-    by_arm = {str(arm): rows for arm, rows in groups[counts].groupby(schema.ARM)}
-    valued = {arm: rows[rows["shown"] > 0] for arm, rows in by_arm.items()}
+    by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
     if len(names) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
         present = ", ".join(f"{arm!r} ({len(rows):,} users)" for arm, rows in valued.items())
@@ -183,78 +222,114 @@ def compare_arms(
     if shares is not None and not {first, second} <= shares.keys():
         raise InputError(f"{name}: shares are given of {', '.join(shares)}; the arms are {names}")
     of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
-    all_a, all_b, of_a, of_b = by_arm[first], by_arm[second], valued[first], valued[second]
-    rows = int(of_a["shown"].sum()), int(of_b["shown"].sum())
-    without_value = int(all_a["rows"].sum()) - rows[0], int(all_b["rows"].sum()) - rows[1]
-    if any(without_value):
+    share, in_arm = of_first / (of_first + of_second), (len(by_arm[first]), len(by_arm[second]))
+    means = _Means.of([valued[arm] for arm in names])
+    lacking = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
+    if any(lacking):
         text = (
-            f"{name}: {column} has no value in {without_value[0]:,} rows of {first} and "
-            f"{without_value[1]:,} of {second}, which are left out; write 0 where it is meant"
+            f"{name}: {column} has no value in {lacking[0]:,} rows of {first} and {lacking[1]:,} "
+            f"of {second}, which are left out; write 0 where it is meant"
         )
         warnings.warn(text, InputNote, stacklevel=2)
-    (value_a, error_a), (value_b, error_b) = (
-        cluster_mean((part["value"] / count).to_numpy(), None, count)
-        for part, count in ((of_a, of_a["shown"].to_numpy()), (of_b, of_b["shown"].to_numpy()))
-    )
-    difference, variance = value_b - value_a, error_b**2 + error_a**2
-    error = math.sqrt(variance)
-    low = high = always_low = always_high = None
-    if min(error_a, error_b) > 0 and min(len(of_a), len(of_b)) >= FEWEST_USERS:
-        mixture = expected or EXPECTED * abs(value_a) or error
-        low, high = difference - _NORMAL * error, difference + _NORMAL * error
-        always_low, always_high = always_valid(difference, variance, mixture)
+    reasons = []
+    if (p_value := _test_split(in_arm, share)) < MISMATCH:
+        # A difference may then be one of the users (Fabijan et al., KDD 2019).
+        reasons.append(
+            f"sample ratio mismatch: {in_arm[0]:,} and {in_arm[1]:,} users, "
+            f"{in_arm[0] / sum(in_arm):.1%} and {in_arm[1] / sum(in_arm):.1%}, where {share:.1%} "
+            f"and {1 - share:.1%} were intended (p = {p_value:.2g}): users are missing from an arm,"
+            " or name the shares that were intended: --shares A=0.9,B=0.1"
+        )
+    planned, always = means.compare(expected, reasons)
+    checked, parts = [], list[GroupDifference]()
+    for guardrail in map(Guardrail.parse, guardrails):
+        values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))[1]
+        if min(len(values.get(arm, ())) for arm in names) < 1:
+            raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
+        checked.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
+    if by is not None:
+        members = dict(list(_sum_by_user(files, column, memory_limit, by).groupby("part")))
+        for part, rows in members.items():
+            values = _split_arms(rows)[1]
+            if min(len(values.get(arm, ())) for arm in names):
+                of_part = _Means.of([values[arm] for arm in names])
+                evidence = of_part.compare(expected, reasons, MISS / len(members))[1]
+                parts.append(GroupDifference(str(part), sum(of_part.users), evidence))
+    mixed = groups[has_user & groups["mixed"]]
     return Comparison(
         column=column,
         arms=(first, second),
-        values=(value_a, value_b),
-        users=(len(of_a), len(of_b)),
-        in_arm=(len(all_a), len(all_b)),
-        shares=(of_first / (of_first + of_second), of_second / (of_first + of_second)),
-        rows=rows,
-        without_value=without_value,
+        values=means.values,
+        users=means.users,
+        in_arm=in_arm,
+        shares=(share, 1 - share),
+        rows=means.rows,
+        without_value=(lacking[0], lacking[1]),
         without_user=int(groups["rows"][~has_user].sum()),
         without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
-        in_several=int((has_user & (groups["arms"] > 1) & groups["last"]).sum()),
-        difference=difference,
-        error=error,
-        low=low,
-        high=high,
-        always_low=always_low,
-        always_high=always_high,
+        in_several=len(mixed["name"].unique()),
+        named=tuple(sorted(mixed["name"].unique())[:_NAMED]),
+        planned=planned,
+        always=always,
+        guardrails=tuple(checked),
+        groups=tuple(parts),
     )
 
 
-def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> pd.DataFrame:
-    """Sum of the values, numbers of values and rows of each user in each arm; "" for no arm."""
+def _split_arms(groups: pd.DataFrame) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:
+    """The users of each arm, and those with a value; without those of several arms."""
+    counts = groups["who"] & (groups[schema.ARM] != "") & ~groups["mixed"]
+    by_arm = {str(arm): rows for arm, rows in groups[counts].groupby(schema.ARM)}
+    return by_arm, {arm: rows[rows["shown"] > 0] for arm, rows in by_arm.items()}
+
+
+def _sum_by_user(
+    files: Sequence[Path], measure: str, memory_limit: str, by: str | None = None
+) -> pd.DataFrame:
+    """Sum of the values, numbers of values and rows of each user in each arm and part, "" for none;
+    and the names of users of several arms.
+
+    Raises:
+        InputError: a column is missing, `measure` is no number, or a value is infinite.
+    """
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
         engine(files, folder, memory_limit) as connection,
     ):
-        tables = tuple(open_tables(connection, files))
+        tables, selects = tuple(open_tables(connection, files)), []
         for table in tables:
-            kinds = table.columns
-            numbers = [name for name, kind in kinds.items() if is_number(kind) or kind == "BOOLEAN"]
-            missing = [name for name in (schema.USER_ID, schema.ARM, column) if name not in kinds]
-            if missing or column not in numbers:
-                fault = f" has no column {', '.join(missing)}"
-                raise InputError(
-                    f"{table.files[0]}{fault if missing else f': {column} is not a number'}; give "
-                    f"the log of ucfrec join; its columns of numbers are {', '.join(numbers)}"
-                )
-        rows = " UNION ALL BY NAME ".join(
-            f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
-            f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
-            f"CAST({quote_name(column)} AS DOUBLE) AS value "
-            f"FROM {table.with_texts([column], (schema.USER_ID, schema.ARM)).sql}"
-            for table in tables
-        )
+            value = bind(connection, table, "a measure", measure)
+            if not (is_number(value.kind) or value.kind == "BOOLEAN"):
+                remedy = "name a column of numbers of the log of ucfrec join"
+                raise wrong_type(table, "what is compared", measure, value.kind, remedy)
+            ids = [
+                table.text_of(bind(connection, table, what, name).columns[0])
+                for what, name in (("users", schema.USER_ID), ("arms of join", schema.ARM))
+            ]
+            part = bind(connection, table, "--by", by) if by is not None else None
+            columns = [*value.columns, *(part.columns if part else ())]
+            selects.append(
+                f"SELECT nullif({ids[0]}, '') AS who, nullif({ids[1]}, '') AS arm, "
+                f"CAST({value.sql} AS DOUBLE) AS value, "
+                f"{f'CAST({part.sql} AS VARCHAR)' if part else 'NULL'} AS part "
+                f"FROM {table.with_texts(columns, (schema.USER_ID, schema.ARM)).sql}"
+            )
+        mixed = "coalesce(min(arm) OVER users <> max(arm) OVER users, false)"
         with explain_errors(connection, tables):
-            return connection.execute(
-                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM ("
-                "SELECT who, arm, coalesce(sum(value), 0) AS value, "
+            rows: pd.DataFrame = connection.execute(
+                "SELECT who IS NOT NULL AS who, coalesce(arm, '') AS arm, "
+                "coalesce(part, '') AS part, value, shown, rows, beyond, "
+                f"{mixed} AS mixed, CASE WHEN {mixed} THEN who END AS name FROM ("
+                "SELECT who, arm, part, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
-                f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
-                "count(arm) OVER (PARTITION BY who) AS arms, "
-                "coalesce(arm = max(arm) OVER (PARTITION BY who), false) AS last "
-                f"FROM ({rows}) GROUP BY who, arm) AS groups ORDER BY groups.arm, groups.who"
+                f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond "
+                f"FROM ({' UNION ALL BY NAME '.join(selects)}) GROUP BY who, arm, part) AS groups "
+                "WINDOW users AS (PARTITION BY groups.who) "
+                "ORDER BY groups.arm, groups.who, groups.part"
             ).df()
+    if beyond := int(rows["beyond"].sum()):
+        raise InputError(
+            f"{first_and_more(files)}: {measure} is infinite or beyond ±{_LARGEST:g} in {beyond:,} "
+            "rows; correct the values, or remove them to leave the rows out"
+        )
+    return rows

@@ -47,24 +47,25 @@ import numpy.typing as npt
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.logged_steps import LoggedSteps, number_clusters
+from ucfrec.results.evidence import Evidence
 from ucfrec.results.statistics import effective_number
 
 SUITE: Final = "off-policy"
 """Suite of the result rows."""
 LOGGED: Final = "logged"
+_OF_MODEL = "only as good as its model, whose error no resampling shows"
+_OF_GROUPS = "right only if the reward of an item depends on its group alone"
+_OF_SHRINKING = "its shrunk weights have an error that no resampling shows"
 _LEAST_RATIO = 1e-12
 """Mean ratio of a position below which nothing is divided by it."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Mean discounted return of a session."""
+@dataclass(frozen=True, kw_only=True)
+class Estimate(Evidence):
+    """Mean discounted return of a session. Its interval is that of `cluster_intervals`; DM, FQE,
+    MIPS and what shrinks weights have none, and where too few sessions have weight and reward."""
 
     value: float
-    low: float | None
-    """Ends of the 95% interval (`cluster_intervals`). None for DM, FQE, MIPS and where weights are
-    shrunk, whose error no resampling shows; and where too few sessions have weight and reward."""
-    high: float | None
     error: float | None
     """Standard error, over users."""
     effective_sessions: float
@@ -73,11 +74,6 @@ class Estimate:
     """Share of the heaviest session in all weight."""
     parameter: float | None = None
     """The tuned λ of an estimator that shrinks weights."""
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """Its ends, if there is one."""
-        return None if self.low is None or self.high is None else (self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -90,8 +86,8 @@ class Terms:
     weights: Float64Array
     """(S,) what each session counts."""
     parameter: float | None = None
-    biased: bool = False
-    """Whether it has an error that no resampling shows: of a model, or of changed weights."""
+    doubt: str = ""
+    """An error that no resampling shows: of a model, or of changed weights."""
 
     @property
     def influences(self) -> Float64Array:
@@ -111,9 +107,9 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     terms = {LOGGED: Terms(steps.returns, ones, ones)}
     if steps.model is not None:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
-        terms["DM"] = Terms(modelled, ones, ones, biased=True)
+        terms["DM"] = Terms(modelled, ones, ones, doubt=_OF_MODEL)
         if not steps.pages:
-            terms["FQE"] = Terms(steps.model.v[steps.first], ones, ones, biased=True)
+            terms["FQE"] = Terms(steps.model.v[steps.first], ones, ones, doubt=_OF_MODEL)
     estimates = summarise(terms, steps.user, seed)
     if not steps.lacking.all() and (terms := session_terms(steps.weighable)):
         estimates |= summarise(terms, steps.weighable.user, seed)
@@ -125,11 +121,18 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
     above, below = np.stack([(term.above, term.below) for term in terms.values()], axis=2)
     estimates, intervals = {}, cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
-        low, high, error, _ = NO_INTERVAL if term.biased or interval is None else interval
-        value, weights = float(term.above.sum() / term.below.sum()), term.weights
-        largest = float(weights.max() / weights.sum()) if weights.any() else 1.0
-        effective = effective_number(weights)
-        estimates[name] = Estimate(value, low, high, error, effective, largest, term.parameter)
+        low, high, error, _ = NO_INTERVAL if term.doubt or interval is None else interval
+        weights = term.weights
+        estimates[name] = Estimate(
+            value=float(term.above.sum() / term.below.sum()),
+            low=low,
+            high=high,
+            reasons=(term.doubt,) if term.doubt else (),
+            error=error,
+            effective_sessions=effective_number(weights),
+            largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
+            parameter=term.parameter,
+        )
     return estimates
 
 
@@ -142,7 +145,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if per_decision is None:
         per_decision = steps.per_session(steps.discounts * weights * steps.reward)
     if by_step is None:
-        by_step = normalise_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
+        by_step = estimate_by_step(steps)
     terms = {
         "IPS": Terms(last * steps.returns, ones, last),
         "SNIPS": Terms(last * steps.returns, last, last),
@@ -159,7 +162,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         terms |= _page_terms(steps)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
-        terms["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
+        terms["MIPS"] = Terms(above, ones, clustered[steps.last], doubt=_OF_GROUPS)
     kinds = {name: (*kind, steps.returns, 0 * ones) for name, kind in IPS_KINDS.items()}
     if steps.model is not None and len(steps.session) == len(steps.first):
         left, value = steps.reward - steps.model.q, steps.model.v
@@ -167,8 +170,8 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     for name, (shrink, parameters, left, value) in kinds.items():
         parameter = tune(shrink, parameters, last, left, value)
         shrunk = shrink(last, parameter)
-        biased = bool((shrunk != last).any())
-        terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, biased)
+        doubt = _OF_SHRINKING if (shrunk != last).any() else ""
+        terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, doubt)
     return terms
 
 
@@ -266,6 +269,11 @@ class StepSums:
         return StepSums(self.sessions + more.sessions, totals, rewarded)
 
 
+def estimate_by_step(steps: LoggedSteps) -> Float64Array:
+    """(S,) whose mean is SNPDIS, and whose spread is its error to first order."""
+    return normalise_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
+
+
 def normalise_by_step(
     steps: LoggedSteps,
     left: Float64Array,
@@ -358,6 +366,22 @@ def cluster_intervals(
         low, high = float(value - high_t * error), float(value - low_t * error)
         intervals.append(Interval(low, high, float(error), above_zero))
     return intervals
+
+
+def simultaneous_intervals(
+    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
+) -> list[tuple[float, float, float]]:
+    """Ratios as of `cluster_intervals`, each with the ends of intervals that hold all of them at
+    once with 95% probability (max-t: Romano & Wolf, Econometrica 2005)."""
+    resamples = resample(above, below, cluster, seed)
+    half = find_critical(np.abs(resamples.studentised)) * resamples.error
+    ends = np.stack([resamples.value, resamples.value - half, resamples.value + half], axis=1)
+    return [(float(value), float(low), float(high)) for value, low, high in ends]
+
+
+def find_critical(deviations: Float64Array) -> float:
+    """The 95% quantile of the largest deviation (B, K) of a resample; one without a spread is 0."""
+    return float(np.quantile(np.nan_to_num(deviations).max(axis=1), 0.95))
 
 
 @dataclass(frozen=True)

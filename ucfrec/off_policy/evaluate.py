@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -12,15 +14,18 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.estimators import (
-    LOGGED,
-    SUITE,
-    Estimate,
-    Terms,
-    estimate,
-    session_terms,
-    summarise,
+from ucfrec.off_policy.answer import (
+    DAY_MS,
+    MOST_LINES,
+    UNKNOWN_TRAFFIC,
+    Traffic,
+    Verdict,
+    add_reasons,
+    conclude,
+    cut_to_steps,
 )
+from ucfrec.off_policy.estimators import LOGGED, SUITE, Estimate, estimate, session_terms
+from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, as_pages, number_pages
 from ucfrec.off_policy.models import (
     InputsFile,
@@ -33,19 +38,20 @@ from ucfrec.off_policy.models import (
 )
 from ucfrec.off_policy.score import LoggedSessions, score_steps, seen_too_often, share_seen
 from ucfrec.off_policy.verdict import (
+    ENOUGH_USERS,
     FAR_OFF,
     MOST_LEFT_OUT,
-    Verdict,
     check_catalogue_size,
-    check_mean_weight,
-    conclude,
     diagnose,
-    list_cautions,
 )
 from ucfrec.provenance import config_hash, provenance, shorten_paths
-from ucfrec.results.rows import ResultRow, ResultTable
+from ucfrec.results.rows import ResultRow, ResultTable, write_results
+from ucfrec.runs.record import read_candidates
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @settings_table("")
@@ -67,70 +73,24 @@ class EstimateOptions:
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
 
+    guardrails: tuple[str, ...] = ()
+    """Least or largest changes of measures in percent, e.g. "dwell_seconds >= -2%", of expressions
+    over the columns of the logs; a launch needs every one."""
+    by: str | None = None
+    """Column of users or items, of the logs or of feature tables, to show the lift by."""
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """The expressions of the guardrails."""
+        return tuple(Guardrail.parse(text).measure for text in self.guardrails)
+
     def __post_init__(self) -> None:
         low, high = self.reward_range or (0.0, 0.0)
         require(low <= high, f"the reward range is {low} to {high}; name the least one first")
+        assert self.measures is not None  # their guardrails can be read
 
 
 DEFAULTS = EstimateOptions()
-
-
-@dataclass(frozen=True)
-class StepValue:
-    """What N' logged steps with a propensity say of the evaluated policy: the mean reward of a step
-    (Dudík, Langford & Li, ICML 2011), had it chosen the item after a history as the logging policy
-    makes them. It says nothing of the return of sessions that the policy itself would make.
-    """
-
-    estimates: dict[str, Estimate]
-    """Mean reward of a step as logged, and by IPS, SNIPS and DR under the evaluated policy."""
-    lift: Estimate
-    """Of DR over the steps as logged."""
-    steps: int
-    """N'."""
-    of: int
-    """All logged steps."""
-    doubt: str | None
-    """Why not to believe the estimates; None if nothing is found."""
-
-    def __str__(self) -> str:
-        ends = ""
-        if self.lift.interval is not None:
-            low, high = self.lift.interval
-            ends = f" [{low:+.4g}, {high:+.4g}]"
-        return (
-            f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
-            f"logging policy's distribution of histories: {self.lift.value:+.4g}{ends} per step by "
-            "DR; not an estimate of the session return"
-        )
-
-
-def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
-    """The value per step; None where all steps have propensities, too few, or no weight."""
-    weighable = ~np.isnan(steps.propensity)
-    if steps.model is None or weighable.all() or weighable.sum() < 2:
-        return None
-    reward, weight = steps.reward[weighable], (steps.target / steps.propensity)[weighable]
-    if not weight.any():
-        return None
-    user = steps.users[steps.session[weighable]]
-    ones = np.ones(len(reward))
-    left = reward - steps.model.logged_reward[weighable]
-    doubly_robust = steps.model.reward[weighable] + weight * left
-    terms = {
-        LOGGED: Terms(reward, ones, ones),
-        "IPS": Terms(weight * reward, ones, weight),
-        "SNIPS": Terms(weight * reward, weight, weight),
-        "DR": Terms(doubly_robust, ones, weight),
-        "lift": Terms(doubly_robust - reward, ones, weight),
-    }
-    estimates = summarise(terms, user, seed)
-    lift, test = estimates.pop("lift"), check_mean_weight("per step", weight, user)
-    doubt = (
-        f"{test} where 1 is expected: propensities are wrong, or those steps lack choices that the "
-        "policy makes"
-    )
-    return StepValue(estimates, lift, len(reward), len(weighable), None if test.passed else doubt)
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,18 +112,40 @@ class OffPolicyReport(ResultTable):
     """(S,) whose they are; None where each is of another user."""
     terms: Float64Array | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
-    per_step: StepValue | None = None
-    """The value per step, where only some steps have propensities."""
     step_rows: Sequence[ResultRow] = ()
-    """Its result rows, one for each estimator."""
+    """Result rows of the value per step, one for each estimator, if there is one."""
 
-    def _said(self) -> list[str]:
-        warnings = [f"warning: {text}" for text in self.warnings]
-        return [*warnings, f"verdict: {self.verdict.headline}"]
+    def list_lines(self, most: int | None = MOST_LINES) -> list[str]:
+        """The answer first, then what it rests on, and what to know of the logs."""
+        lines = self.verdict.list_lines()
+        lines += [f"note: {text}" for text in self.warnings if text not in self.verdict.reasons]
+        if most is None or len(lines) <= most:
+            return lines
+        return [*lines[: most - 1], f"{len(lines) - most + 1} more lines: --details"]
+
+    def save(self, file: Path | str) -> None:
+        """Write all rows as JSON, as `ucfrec ope --json` does, for `report`."""
+        write_results(Path(file), [*self.rows, *self.step_rows])
+
+    def __repr__(self) -> str:
+        return "\n".join(self.list_lines())
+
+    def _repr_html_(self) -> str:
+        answer, *lines = (f"<p>{escape(line)}</p>" for line in self.list_lines())
+        table = self._table().to_html(index=False, float_format="{:.4g}".format, na_rep="–")
+        return f"<strong>{answer}</strong>{''.join(lines)}{table}"
+
+    def _table(self) -> "pd.DataFrame":
+        """Estimates with a reason against them have none of the numbers."""
+        frame = super()._table()
+        doubtful = [bool(row.details.get("reasons")) for row in self.rows]
+        numbers = [name for name in frame if str(name).startswith(("R_cum", "effective"))]
+        frame.loc[doubtful, numbers] = np.nan
+        return frame
 
 
 @dataclass
-class Evidence:
+class WeighedLogs:
     """Logged steps, and what the logs say of an estimate beside their weights."""
 
     steps: LoggedSteps
@@ -174,9 +156,12 @@ class Evidence:
     declared: str = ""
     fingerprint: str | None = None
     models: ModelReport | None = None
-    per_step: StepValue | None = None
-    excludes_seen: bool = False
-    """Whether logs say where items that users had seen were excluded."""
+    measures: Mapping[str, Float64Array] = field(default_factory=dict)
+    groups: Groups | None = None
+    """As of `LoggedSessions`."""
+    traffic: Traffic = UNKNOWN_TRAFFIC
+    nearby: str = ""
+    """See `name_nearby_rule`."""
     forbidden: list[str] = field(default_factory=list)
     """What forbids a conclusion."""
     remarks: list[str] = field(default_factory=list)
@@ -198,8 +183,10 @@ def evaluate_off_policy(
         InputError: propensities are not probabilities, there is only one user, or a page would have
             a session of several steps.
     """
+    if {*options.measures} != {*logged.measures} or (options.by and logged.groups is None):
+        raise InputError("--guardrail and --by read further columns of logs: name the logs")
     rule, store = rule or trained.rule, logged.store
-    steps, models, declared = collect_steps(trained, logged, rule, seed, options)
+    steps, models, declared, concentration = collect_steps(trained, logged, rule, seed, options)
     assert steps.groups is not None
     columns = {
         "seen_in_training": share_seen(trained, store),
@@ -207,17 +194,17 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **{f"model_{name}": value for name, value in asdict(models).items()},
     }
-    evidence = Evidence(
+    logs = WeighedLogs(
         steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
     )
-    evidence.excludes_seen = schema.EXCLUDES_SEEN in store.record.columns
-    _doubt_logs(evidence, logged, options.pages)
-    items, in_catalogue = len(trained.items), steps.groups.number >= 0
-    implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
+    _doubt_logs(logs, logged, options.pages)
+    n_items, in_catalogue = len(trained.items), steps.groups.number >= 0
+    implied = None if declared else check_catalogue_size(steps, in_catalogue, n_items)
     if implied is not None and not implied.passed:
-        evidence.forbidden.append(
-            f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
-            f"items to choose from, the run knows {items:,}: propensities are too small"
+        logs.forbidden.append(
+            f"the propensities imply {implied.mean * n_items:,.0f} ± "
+            f"{implied.error * n_items:,.0f} items to choose from, the run knows {n_items:,}: "
+            "propensities are too small"
         )
     if options.pages:
         page, position = _find_pages(logged)
@@ -226,53 +213,94 @@ def evaluate_off_policy(
         # The quarter of the logs, 1 to 4 by time, in which each session begins.
         times = store.column(schema.TIMESTAMP)[steps.first]
         quartiles = np.quantile(times, [0.25, 0.5, 0.75])
-        evidence.segment = 1 + np.searchsorted(quartiles, times, side="right")
-        evidence.per_step = step_value(steps, seed)
+        logs.segment = 1 + np.searchsorted(quartiles, times, side="right")
+        logs.traffic = Traffic(
+            days=float(np.ptp(times)) / DAY_MS,
+            users=len(np.unique(steps.users)),
+            steps=len(steps.reward),
+            draws=concentration * n_items,
+        )
     clusters = steps.cluster_weights
     if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
         # The estimated probabilities of groups are not good enough for sessions of this length.
         steps = replace(steps, cluster_propensity=None, cluster_target=None)
-        evidence.remarks.append(
+        logs.remarks.append(
             f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
-    if not models.converged:
-        evidence.remarks.append(
-            "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
-            "stopped: ignore FQE"
-        )
-    if evidence.per_step is not None and evidence.per_step.doubt:
-        evidence.remarks.append(evidence.per_step.doubt)
-    evidence.steps = steps
-    return make_report(trained, rule, evidence, seed, options)
+    logs.steps, logs.nearby = steps, name_nearby_rule(trained, rule)
+    logs.measures, logs.groups = logged.measures, logged.groups
+    return make_report(trained, rule, logs, seed, options)
+
+
+def name_nearby_rule(trained: TrainedPolicy, rule: DecisionRule) -> str:
+    """The best rule that the validation sessions of a run support, as options; "" without one."""
+    base, supported = rule.as_dict(), list[tuple[float, str]]()
+    for candidate in read_candidates(trained.folder):
+        support = candidate.evidence and candidate.evidence.effective_users
+        parts = candidate.rule.as_dict().items() - base.items()
+        if (support or 0.0) >= ENOUGH_USERS and all(part is not None for _, part in parts):
+            words = (f"--{name.replace('_', '-')} {part:g}" for name, part in sorted(parts))
+            supported.append((candidate.value or 0.0, " ".join(words)))
+    options = max(supported, default=(0.0, ""))[1]
+    return f"evaluate a rule that such logs support: {options}" if options else ""
 
 
 def make_report(
     trained: TrainedPolicy,
     rule: DecisionRule,
-    evidence: Evidence,
+    logs: WeighedLogs,
     seed: int,
     options: EstimateOptions,
 ) -> OffPolicyReport:
     """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
     mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
     """
-    steps, per_step = evidence.steps, evidence.per_step
-    estimates = estimate(steps, seed)
-    diagnosis = diagnose(steps, options.reward_range, evidence.segment)
+    steps, model = logs.steps, logs.models
+    diagnosis = diagnose(steps, options.reward_range, logs.segment)
     verdict = conclude(
         steps,
         seed,
         diagnosis,
         wanted_lift=options.wanted_lift,
-        forbidden=evidence.forbidden,
-        declared=evidence.declared,
-        filter_seen=evidence.excludes_seen,
+        forbidden=logs.forbidden,
+        declared=logs.declared,
+        days=logs.traffic.days,
     )
-    warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
-    judged = evidence.columns | asdict(verdict) | diagnosis.list_columns()
-    judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
-    del judged["estimator"], judged["reasons"]
-    record, of_steps = trained.record, {} if per_step is None else per_step.estimates
+    single, traffic = cut_to_steps(steps), logs.traffic
+    of_steps: dict[str, Estimate] = {}
+    if not verdict.lift.is_reliable and not options.pages:
+        plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
+        verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
+        if single is not None:
+            per_step = conclude(single, seed, forbidden=logs.forbidden)
+            of_steps = add_reasons(estimate(single, seed), per_step.reasons)
+            verdict = replace(verdict, per_step=per_step)
+    weighable = None if steps.lacking.all() else steps.weighable
+    terms = None
+    if weighable is not None and verdict.estimator is not None:
+        terms = session_terms(weighable)[verdict.estimator].influences
+        if logs.groups is not None:
+            lifts = terms - weighable.returns
+            groups = compare_groups(logs.groups, steps, lifts, seed)
+            verdict = replace(verdict, groups=groups)
+    guardrails = [
+        check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
+        for text, measure in zip(options.guardrails, options.measures, strict=True)
+    ]
+    verdict = replace(verdict, guardrails=guardrails)
+    estimates = add_reasons(estimate(steps, seed), verdict.reasons)
+    if model is not None and not model.converged:
+        diverged = "it diverged: its values exceed the largest possible return"
+        estimates["FQE"] = replace(estimates["FQE"], reasons=(diverged,))
+    if 0 < diagnosis.left_out < diagnosis.sessions:
+        logs.remarks.append(
+            f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
+            "propensity: estimates that weigh leave these sessions out"
+        )
+    warnings = [*verdict.reasons, *logs.remarks]
+    judged = logs.columns | diagnosis.list_columns() | verdict.list_columns()
+    judged |= {"warnings": warnings}
+    record = trained.record
     base = ResultRow(
         suite=SUITE,
         table="estimates",
@@ -287,30 +315,25 @@ def make_report(
             "pages": options.pages,
             "anonymous": not options.users_known,
             "sessions": len(steps.first),
-            "steps": evidence.rows,
+            "steps": logs.rows,
             "choice": "softmax" if rule.draws else "greedy",
         },
         config_hash=config_hash(record.settings),
-        data_fingerprint=evidence.fingerprint,
+        data_fingerprint=logs.fingerprint,
         metric="R_cum",
         metrics={},
         target_return=rule.target,
         rule=rule.hash,
         **provenance(),
     )
-    weighable = None if steps.lacking.all() else steps.weighable
-    terms = None
-    if weighable is not None and verdict.estimator is not None:
-        terms = session_terms(weighable)[verdict.estimator].influences
     return OffPolicyReport(
         rows=_make_rows(base, estimates, rule, judged),
         warnings=warnings,
         verdict=verdict,
-        models=evidence.models,
+        models=logs.models,
         returns=np.empty(0) if weighable is None else weighable.returns,
         user=None if weighable is None else weighable.user,
         terms=terms,
-        per_step=per_step,
         step_rows=_make_rows(
             replace(base, table="per step", metric="R_step"), of_steps, rule, judged
         ),
@@ -336,36 +359,37 @@ def _make_rows(
             f"effective_{units}": result.effective_sessions,
             "largest_weight": result.largest_weight,
             "parameter": result.parameter,
+            "reasons": result.reasons or None,
             "decision_rule": rule.as_dict(),
         }
         rows.append(row.extended({**numbers, **judged}))
     return rows
 
 
-def _doubt_logs(evidence: Evidence, logged: LoggedSessions, pages: bool) -> None:
+def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions, pages: bool) -> None:
     """Add what rows seen in training, of unknown items, and dropped rows say."""
-    seen, dropped = evidence.columns["seen_in_training"], logged.report["dropped"]
-    evidence.forbidden += seen_too_often(seen)
+    seen, dropped = logs.columns["seen_in_training"], logged.report["dropped"]
+    logs.forbidden += seen_too_often(seen)
     if seen is None:
-        evidence.remarks.append(
+        logs.remarks.append(
             "the store that the run was trained on is gone or has changed: whether these logs were "
             "seen in training is not known, and users begin without a history; move the run "
             "together with its store"
         )
     if logged.unknown_items:
-        evidence.remarks.append(
+        logs.remarks.append(
             f"{logged.unknown_items:,} rows show items that the run does not know, and so never "
             "would: they weigh 0"
         )
     if without_reward := dropped.get("reward_not_finite", 0):
         rows = logged.store.n_steps + without_reward
         much = without_reward > MOST_LEFT_OUT * rows
-        (evidence.forbidden if much else evidence.remarks).append(
+        (logs.forbidden if much else logs.remarks).append(
             f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
             + ", and may differ from the rest" * much
         )
     if pages and (repeated := dropped.get("duplicate", 0)):
-        evidence.remarks.append(
+        logs.remarks.append(
             f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "
             "page can show an item twice, log its positions a millisecond apart"
         )
@@ -389,10 +413,10 @@ def collect_steps(
     rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
-) -> tuple[LoggedSteps, ModelReport, str]:
+) -> tuple[LoggedSteps, ModelReport, str, float]:
     """The logged steps, in order, with the policy's probabilities and models of its return; how
-    good the models are; and which propensities are estimated, "" if none is. What the models see,
-    and the probabilities of groups, lie on disk."""
+    good the models are; which propensities are estimated, "" if none is; and the mean of Σ π(a)².
+    What the models see, and the probabilities of groups, lie on disk."""
     store = logged.store
     propensity = np.full(store.n_steps, np.nan)
     if schema.PROPENSITY in store.record.columns:
@@ -417,7 +441,7 @@ def collect_steps(
     assert trained.item_states is not None
     group_of = group_items(trained.item_states.embeddings.numpy(), options.item_groups, seed)
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
-    target, end = np.empty(len(items)), 0
+    target, end, squares = np.empty(len(items)), 0, 0.0
     groups = ItemGroups(
         np.where(
             items >= 0,
@@ -432,6 +456,7 @@ def collect_steps(
         target[rows], probabilities, batch_inputs = make_inputs(trained, batch)
         groups.target[rows] = (probabilities @ one_hot).numpy()
         inputs.append(batch_inputs)
+        squares += float(probabilities.square().sum())
         end = rows.stop
     columns: dict[str, Any] = {}
     declared, unknown = "", int(np.isnan(propensity).sum())
@@ -446,4 +471,5 @@ def collect_steps(
             declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
             columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
     modelled, models = fit_models(inputs.chunks, plain, seed)
-    return replace(plain, target=target, model=modelled, groups=groups, **columns), models, declared
+    steps = replace(plain, target=target, model=modelled, groups=groups, **columns)
+    return steps, models, declared, squares / len(items)

@@ -1,8 +1,8 @@
 """Logs read as a policy's training logs were, and its probability of each logged choice."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
@@ -18,7 +18,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import sessions_before
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import seen_before
 from ucfrec.errors import InputError
@@ -28,6 +28,8 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.rows import mix_bits
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.logs.summary import note_unknown
+from ucfrec.off_policy.further_columns import read_groups, read_measure
+from ucfrec.off_policy.guardrails import Groups
 from ucfrec.processes import progress
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -62,6 +64,9 @@ class LoggedSessions:
     """The rows of the users, those of the run's store too."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
+    measures: Mapping[str, Float64Array] = field(default_factory=dict)
+    """(N,) values at the steps, by the expression of a guardrail."""
+    groups: Groups | None = None
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,8 @@ def read_logged_sessions(
     mapping: LogMapping,
     keep_unknown: bool = False,
     memory_limit: str = "2GB",
+    measures: Sequence[str] = (),
+    by: str | None = None,
 ) -> AbstractContextManager[LoggedSessions]:
     """Read logs in the same way as the training logs of a run; they are on disk until the block of
     this context manager ends.
@@ -100,6 +107,8 @@ def read_logged_sessions(
         mapping: which columns mean what; what it leaves open is as in the training logs.
         keep_unknown: keep rows whose item the run does not know, as item −1; else they are dropped
             and counted in the report.
+        measures: expressions over the columns of the logs to read, too.
+        by: column to group users or items by.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
@@ -107,7 +116,7 @@ def read_logged_sessions(
     """
     require_items(trained)
     mapping, options = training_options(trained, mapping, memory_limit)
-    return prepare_sessions(trained, files, mapping, options, keep_unknown)
+    return prepare_sessions(trained, files, mapping, options, keep_unknown, measures, by)
 
 
 def training_options(
@@ -133,6 +142,8 @@ def prepare_sessions(
     mapping: LogMapping,
     options: PrepareOptions,
     keep_unknown: bool = False,
+    measures: Sequence[str] = (),
+    by: str | None = None,
 ) -> Iterator[LoggedSessions]:
     """`read_logged_sessions` of logs whose columns and options are given in full."""
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
@@ -151,8 +162,19 @@ def prepare_sessions(
             name, where = str(files[0]), "the run was trained on"
             note_unknown(name, schema.USER_ID, strangers, report["users"], where)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
+        values = {
+            measure: read_measure(files, mapping, options, run, keep_unknown, measure, store)
+            for measure in measures
+        }
+        groups = None
+        if by is not None:
+            user_ids, numbers = np.unique(users, return_inverse=True)
+            of_users = user_ids, numbers[store.all_steps()[0]]
+            of_items = trained.items.ids, store.column(schema.ITEM).astype(np.int64)
+            ids = {schema.USER_ID: of_users, schema.ITEM_ID: of_items}
+            groups = read_groups(files, mapping, replace(options, temp_folder=scratch), by, ids)
         store, rows = _add_history(trained, store, users, _readable_store(trained))
-        yield LoggedSessions(store, users, report, rows, unknown)
+        yield LoggedSessions(store, users, report, rows, unknown, values, groups)
 
 
 def _add_history(

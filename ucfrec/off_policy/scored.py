@@ -22,8 +22,9 @@ from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_file, atomic_folder, require_file
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.off_policy.answer import DAY_MS, Traffic
 from ucfrec.off_policy.estimators import StepSums, normalise_by_step
-from ucfrec.off_policy.evaluate import EstimateOptions, Evidence, OffPolicyReport, make_report
+from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, WeighedLogs, make_report
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import (
     PROBABILITY,
@@ -63,10 +64,11 @@ def evaluate_scored(
         InputError: a file is missing, damaged, has no propensities, was scored by another run or
             rule, or is not in the order of `score`; or the options need the logs.
     """
-    if options.pages or options.estimate_propensities or options.reward_range is not None:
+    of_steps = (options.pages, options.estimate_propensities, options.guardrails, options.by)
+    if any(of_steps) or options.reward_range is not None:
         raise InputError(
-            "pages, estimated propensities and a reward range (of single steps) need the logs; "
-            "leave --scored out"
+            "pages, estimated propensities, guardrails, groups and a reward range (of single "
+            "steps) need the logs; leave --scored out"
         )
     files: list[Path] = []
     for path in map(Path, paths):
@@ -76,30 +78,32 @@ def evaluate_scored(
     described = [_read_metadata(file, trained, rule) for file in files]
     rows = sum(metadata.num_rows for metadata in described)
     sessions = _sum_sessions(files, options)
-    every, keys = max(1, rows // _TESTED_ROWS), []
+    every, keys, clock = max(1, rows // _TESTED_ROWS), [], list[int]()
     for file in files:
         for batch in _read_batches(file, _KEYS):
             users, items, times = (batch[name][::every] for name in _KEYS)
+            clock += [times.min(), times.max()]
             users, items = trained.users.numbers(users), trained.items.numbers(items)
             keys.append(hash_rows(users, items, times))
     seen = share_of_rows_seen(trained, np.concatenate(keys))
-    evidence = Evidence(sessions, rows, {"seen_in_training": seen})
-    evidence.remarks.append("from scored rows: without models of the reward there is no DR")
+    logs = WeighedLogs(sessions, rows, {"seen_in_training": seen})
+    logs.traffic = Traffic(days=float(np.ptp(clock)) / DAY_MS)
+    logs.remarks.append("from scored rows: without models of the reward there is no DR")
     counts = [(metadata.metadata or {}).get(UNKNOWN_ITEMS.encode(), b"") for metadata in described]
     if not all(count.isdigit() for count in counts):
-        evidence.remarks.append(
+        logs.remarks.append(
             "rows of items that the run does not know are not part of scored rows; where the logs "
             "have many, estimate from the logs"
         )
     elif unknown := sum(map(int, counts)):
         # In the logs they weigh 0; here sessions lack them.
         much = unknown > MOST_LEFT_OUT * (rows + unknown)
-        (evidence.forbidden if much else evidence.remarks).append(
+        (logs.forbidden if much else logs.remarks).append(
             f"{unknown:,} of {rows + unknown:,} rows show items that the run does not know, and "
             "are not part of scored rows: estimate from the logs, where they weigh 0"
         )
-    evidence.forbidden += seen_too_often(seen)
-    return make_report(trained, rule, evidence, seed, options)
+    logs.forbidden += seen_too_often(seen)
+    return make_report(trained, rule, logs, seed, options)
 
 
 def _read_metadata(file: Path, trained: TrainedPolicy, rule: DecisionRule) -> pq.FileMetaData:

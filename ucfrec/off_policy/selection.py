@@ -19,12 +19,10 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.estimators import resample
+from ucfrec.off_policy.estimators import find_critical, resample
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
-
-LEVEL = 0.95
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ def select(
         raise InputError(f"terms are not finite at {(~np.isfinite(terms)).sum()} places")
     resamples = resample(terms, np.ones_like(terms), user, seed)
     value, error = resamples.value, resamples.error
-    half = _critical(np.abs(resamples.studentised)) * error
+    half = find_critical(np.abs(resamples.studentised)) * error
     again = value + resamples.shift
     best = again == again.max(axis=1, keepdims=True)
     share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
@@ -124,16 +122,11 @@ def select(
         # Upper end of how much better than the first any other may be.
         lead = np.delete(terms, first, axis=1) - terms[:, [first]]
         leads = resample(lead, np.ones_like(lead), user, seed)
-        upper = leads.value + _critical(-leads.studentised) * leads.error
+        upper = leads.value + find_critical(-leads.studentised) * leads.error
         # Candidates that never differ are neither better nor worse.
         differ = np.isfinite(leads.studentised).any(axis=0)
         regret = float(upper[differ].max(initial=0.0))
     return Selection(tuple(standings), corrected, regret)
-
-
-def _critical(deviations: Float64Array) -> float:
-    """Quantile of the largest deviation over candidates, 0 of one without a spread."""
-    return float(np.quantile(np.nan_to_num(deviations).max(axis=1), LEVEL))
 
 
 def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
@@ -151,7 +144,7 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
             )
     excluded, terms = dict[str, str](), dict[str, Float64Array]()
     for name, report in reports.items():
-        if report.verdict.reliable and report.terms is not None:
+        if report.verdict.lift.is_reliable and report.terms is not None:
             terms[name] = report.terms
         else:
             excluded[name] = "; ".join(report.verdict.reasons)

@@ -1,4 +1,4 @@
-"""Whether to believe an off-policy estimate, and what it says: computed, in plain words.
+"""Whether to believe an off-policy estimate: tests of the weights, and reasons in plain words.
 
 With true propensities, ratios have mean 1 at every step, and so have their products. Means below 1
 come of choices that the logs lack or of propensities that are too large; means above 1 of too small
@@ -6,7 +6,6 @@ ones.
 """
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any, Final
@@ -14,12 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.estimators import (
-    NO_INTERVAL,
-    cluster_intervals,
-    cluster_mean,
-    session_terms,
-)
+from ucfrec.off_policy.estimators import cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
@@ -39,7 +33,7 @@ FAR_OFF: Final = 0.1
 """Distance of a mean session weight from 1 that counts, though no test may show it."""
 MOST_LEFT_OUT: Final = 0.05
 """Largest share of sessions, or rows, without which an estimate stands."""
-_SIGNIFICANCE, _TOLERANCE, _ERRORS = 0.01, 0.02, 3.0
+_SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
 SESSION_PRODUCTS: Final = "session products"
 
 
@@ -63,13 +57,11 @@ class Diagnosis:
 
     sessions: int
     users: int
-    left_out: int
+    left_out: int = 0
     """Sessions with a step of unknown propensity: no part of what follows."""
     overlap: float | None = None
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
     tests: tuple[WeightTest, ...] = ()
-    effective_by_step: tuple[float, ...] = ()
-    """(T,) effective users at each step, of the products up to it; empty of sums of sessions."""
     effective_users: float = 0.0
     """Of the session products, summed by user."""
     largest_weight: float = 1.0
@@ -91,19 +83,11 @@ class Diagnosis:
             "users": self.users,
             "sessions_without_propensity": self.left_out,
             "effective_users": self.effective_users,
-            "effective_by_step": self.effective_by_step,
-            "unsupported_from_step": self.unsupported_from_step,
             "weight_tests": [asdict(test) for test in self.tests],
             "mean_weight": self.mean_weight,
             "pareto_tail": self.tail,
             "bounds": self.bounds,
         }
-
-    @property
-    def unsupported_from_step(self) -> int | None:
-        """First step (from 1) with fewer effective users than an estimate needs, if any."""
-        places = enumerate(self.effective_by_step, start=1)
-        return next((place for place, users in places if users < ENOUGH_USERS), None)
 
 
 def diagnose(
@@ -121,16 +105,8 @@ def diagnose(
     weights = weighable.session_weights
     by_user = np.bincount(weighable.users, weights).astype(np.float64)
     rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns))
-    # An ended session keeps the weight of its last step.
-    totals, effective = np.bincount(weighable.users).astype(np.float64), []
-    changes = weighable.weights - weighable.shift(weighable.weights)
-    step_user = weighable.users[weighable.session]
     bounds = None
     if weighable.per_decision is None:
-        for rows in weighable.rows_by_place:
-            change = np.bincount(step_user[rows], changes[rows], len(totals))
-            totals = np.maximum(totals + change, 0)
-            effective.append(effective_number(totals))
         observed = float(steps.reward.min()), float(steps.reward.max())
         bounds = identification_bounds(weighable, reward_range or observed)
     return Diagnosis(
@@ -139,7 +115,6 @@ def diagnose(
         left_out=int(incomplete.sum()),
         overlap=float((weighable.target / weighable.propensity).mean()),
         tests=weight_tests(weighable, None if segment is None else segment[~incomplete]),
-        effective_by_step=tuple(effective),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
@@ -186,12 +161,6 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
         WeightTest(name, mean, error, abs(mean - 1) <= max(_TOLERANCE, limit * error))
         for name, mean, error in means
     )
-
-
-def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> WeightTest:
-    """Test that weights (N,) of users (N,) have mean 1, within three standard errors."""
-    mean, error = cluster_mean(weights, user)
-    return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 
 
 def check_catalogue_size(
@@ -254,133 +223,9 @@ def identification_bounds(
     return float(supported + worth * low), float(supported + worth * high)
 
 
-BEST_FIRST: Final = ("DR", "SNPDIS")
-"""The estimator that a verdict is about: the first of these that there is."""
-_SEEN_REMOVED = (
-    "such as seen items, which serve excludes without --keep-seen: evaluate with --filter-seen"
-)
-OTHERS_REMOVED: Final = (
-    "such as items that requests excluded by candidates, or that another system removed: with "
-    "--filter-seen, seen items are left out already"
-)
-"""Why logs may lack choices of a policy that is evaluated without seen items."""
-_DETECTED = 1.96 + 0.84
-"""Standard errors in a lift that 80% of samples would find at 95% confidence."""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the logs say of the evaluated policy against the behavior policy."""
-
-    reliable: bool
-    reasons: tuple[str, ...]
-    """What forbids a conclusion; empty if reliable."""
-    estimator: str | None
-    """Which estimate the rest is of; None where nothing could be weighed."""
-    lift: float | None
-    """Its value less the mean return as logged, on the same sessions."""
-    lift_low: float | None
-    """Ends of the 95% interval, studentised, clustered by user."""
-    lift_high: float | None
-    probability_better: float | None
-    """Share of the bootstrap's resamples in which the lift is above 0."""
-    wanted_lift: float
-    sessions_needed: int | None
-    """Logged sessions like these that would show `wanted_lift` in 80% of samples."""
-    declared: str = ""
-    """What the estimate rests on beside the logs, e.g. estimated propensities."""
-
-    def __str__(self) -> str:
-        return f"{self.headline}: {'; '.join(self.reasons)}" if self.reasons else self.headline
-
-    @property
-    def headline(self) -> str:
-        """The verdict without its reasons."""
-        rests_on = f" ({self.declared})" if self.declared else ""
-        if not self.reliable or self.lift_low is None or self.lift_high is None:
-            return f"Do not rely on this estimate{rests_on}"
-        if self.lift_low > 0:
-            says = "The policy has a higher return than the logged one"
-        elif self.lift_high < 0:
-            says = "The policy has a lower return than the logged one"
-        else:
-            says = "The logs do not show whether the policy or the logged one has the higher return"
-        return (
-            f"{says}: {self.lift:+.4g} per session [{self.lift_low:+.4g}, {self.lift_high:+.4g}] "
-            f"by {self.estimator}, better with probability {self.probability_better:.3f}; a lift "
-            f"of {self.wanted_lift:.4g} would show with about {self.sessions_needed or 0:,} "
-            f"sessions{rests_on}"
-        )
-
-
-def conclude(
-    steps: LoggedSteps,
-    seed: int,
-    diagnosis: Diagnosis | None = None,
-    wanted_lift: float | None = None,
-    forbidden: Sequence[str] = (),
-    declared: str = "",
-    filter_seen: bool = False,
-) -> Verdict:
-    """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing else
-    is `forbidden`. `wanted_lift` is the return per session that a launch should gain; None for 5%
-    of the mean logged.
-    """
-    diagnosis = diagnosis or diagnose(steps)
-    reasons = [*forbidden, *_list_reasons(diagnosis, filter_seen)]
-    if wanted_lift is None:
-        wanted_lift = 0.05 * abs(float(steps.returns.mean()))
-    terms = {} if steps.lacking.all() else session_terms(steps.weighable)
-    name = next((name for name in BEST_FIRST if name in terms), None)
-    lift = interval = needed = None
-    if name is not None:
-        lifts = terms[name].influences - steps.weighable.returns
-        lift, ones = float(lifts.mean()), np.ones((len(lifts), 1))
-        (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
-        if interval is None:
-            reasons.append("the sessions do not differ enough for an interval")
-        elif wanted_lift > 0:
-            needed = math.ceil(len(lifts) * (_DETECTED * interval.error / wanted_lift) ** 2)
-    low, high, _, better = interval or NO_INTERVAL
-    return Verdict(
-        reliable=name is not None and not reasons,
-        reasons=tuple(reasons),
-        estimator=name,
-        lift=lift,
-        lift_low=low,
-        lift_high=high,
-        probability_better=better,
-        wanted_lift=wanted_lift,
-        sessions_needed=needed,
-        declared=declared,
-    )
-
-
-def list_cautions(diagnosis: Diagnosis, estimators: Iterable[str]) -> list[str]:
-    """What to know of an estimate that may stand all the same."""
-    cautions, stops = [], diagnosis.unsupported_from_step
-    if 0 < diagnosis.left_out < diagnosis.sessions:
-        cautions.append(
-            f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
-            "propensity: estimates that weigh leave these sessions out"
-        )
-    if stops is not None:
-        cautions.append(
-            f"from step {stops} on fewer than {ENOUGH_USERS} effective users are left: the logs "
-            "do not support an estimate there"
-        )
-    if "DM" in estimators:
-        cautions.append("DM and FQE are only as good as their models: they carry no interval")
-    if "MIPS" in estimators:
-        cautions.append(
-            "MIPS is right only if the reward of an item depends on its group alone: no interval"
-        )
-    return cautions
-
-
-def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
+def list_reasons(diagnosis: Diagnosis) -> list[str]:
     """What forbids a conclusion, the gravest first."""
-    if diagnosis.overlap is None:
+    if diagnosis.left_out == diagnosis.sessions:
         return ["no session has all its propensities, so nothing can be weighed"]
     reasons = []
     if diagnosis.left_out > MOST_LEFT_OUT * diagnosis.sessions:
@@ -388,13 +233,18 @@ def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
             f"{diagnosis.left_out / diagnosis.sessions:.0%} of the sessions have a step without "
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
         )
+    if diagnosis.effective_users < ENOUGH_USERS:
+        reasons.append(
+            f"the weights leave {diagnosis.effective_users:,.0f} effective of {diagnosis.users:,} "
+            f"users (below {ENOUGH_USERS})"
+        )
     mean = diagnosis.mean_weight
     if failed := [test for test in diagnosis.tests if not test.passed]:
-        reasons.append(_explain_failure(failed, diagnosis, filter_seen))
+        reasons.append(_explain_failure(failed, diagnosis))
     elif mean is not None and abs(mean - 1) > FAR_OFF:
         reasons.append(
-            f"the mean session weight is {mean:.2f} where 1 is expected: at random, sessions that "
-            f"the policy would often have are too {'rare' if mean < 1 else 'many'}; give more logs"
+            f"the mean weight is {mean:.2f} where 1 is expected: at random, what the policy would "
+            f"often show is too {'rare' if mean < 1 else 'frequent'}; give more logs"
         )
     if not diagnosis.rewarded_users:
         reasons.append("no session has both weight and reward: the logs support no estimate")
@@ -402,11 +252,6 @@ def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
         reasons.append(
             f"only {diagnosis.rewarded_users} users have both weight and reward (below "
             f"{ENOUGH_REWARDED})"
-        )
-    if diagnosis.effective_users < ENOUGH_USERS:
-        reasons.append(
-            f"the weights leave {diagnosis.effective_users:,.0f} effective of {diagnosis.users:,} "
-            f"users (below {ENOUGH_USERS})"
         )
     if diagnosis.largest_weight > DOMINANT:
         reasons.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
@@ -417,7 +262,7 @@ def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
     return reasons
 
 
-def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis, filter_seen: bool) -> str:
+def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis) -> str:
     """What the worst of the failed tests shows."""
 
     def rank(test: WeightTest) -> tuple[bool, float]:
@@ -425,23 +270,13 @@ def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis, filter_seen
         return test.name == SESSION_PRODUCTS, abs(math.log(max(test.mean, 1e-12)))
 
     worst = max(failed, key=rank)
-    alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
-    # Where few users have most of the weight, tests that take means for normal reject too often.
-    few_weigh = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.effective_users < ENOUGH_USERS
     if worst.mean >= 1:
         return f"{worst}, where 1 is expected: propensities are too small"
-    if alone and few_weigh:
-        cause = (
-            "sessions that the policy would often have may be too rare in these logs: give more "
-            "logs; or the logs lack choices that the policy makes"
-        )
-    else:
-        removed = OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
-        cause = (
-            f"the logs lack choices that the policy makes ({removed}), or propensities are too "
-            "large"
-        )
-    reason = f"{worst}, where 1 is expected: {cause}"
+    reason = (
+        f"{worst}, where 1 is expected: the logs lack choices that the policy makes, such as seen "
+        "items or what requests exclude (log excludes_seen and candidates), or propensities are "
+        "too large"
+    )
     if diagnosis.bounds is None:
         return reason
     low, high = diagnosis.bounds

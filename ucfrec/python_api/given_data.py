@@ -161,12 +161,14 @@ def read_logs(
     logs: Logs | None,
     mapping: Columns | None,
     keep_unknown: bool,
+    measures: Sequence[str] = (),
+    by: str | None = None,
 ) -> Iterator[LoggedSessions]:
     """Later logs of a policy, or None for the test split of its store.
 
     Args:
         mapping: of their columns; what it leaves open is as in the training log.
-        keep_unknown: see `read_logged_sessions`.
+        keep_unknown: see `read_logged_sessions`, also for `measures` and `by`.
 
     Raises:
         InputError: the logs cannot be used.
@@ -179,7 +181,9 @@ def read_logs(
     with (
         open_files(trained, logs, mapping) as (files, columns, frame),
         use_words_of_python(frame),
-        read_logged_sessions(trained, files, columns, keep_unknown) as logged,
+        read_logged_sessions(
+            trained, files, columns, keep_unknown, measures=measures, by=by
+        ) as logged,
     ):
         _note_dropped(logged.report)
         yield logged

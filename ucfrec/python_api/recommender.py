@@ -388,7 +388,8 @@ class Recommender:
             seed: of the folds and the bootstrap.
         """
         trained = self._load_for(logs)
-        with read_logs(trained, logs, mapping, keep_unknown=True) as logged:
+        read = read_logs(trained, logs, mapping, True, options.measures, options.by)
+        with read as logged:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
@@ -454,6 +455,7 @@ class Recommender:
         *,
         window_days: float | None = None,
         refit: bool = True,
+        allow_argmax: bool = False,
         mapping: Columns | None = None,
     ) -> Self:
         """Bring the policy up to date with new logs: `ucfrec update`.
@@ -465,13 +467,16 @@ class Recommender:
             window_days: leave out sessions that ended longer ago, before the end of the new logs;
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
+            allow_argmax: let a decision rule that draws items come to take the best; new logs then
+                have no propensities to evaluate from.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and
             the verdict on both.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
-        options = UpdateOptions(AppendOptions(window), refit=refit)
+        append = AppendOptions(window)
+        options = UpdateOptions(append, refit=refit, allow_argmax=allow_argmax)
         opened = open_files(self.trained, logs, mapping)
         with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)

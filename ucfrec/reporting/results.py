@@ -18,6 +18,7 @@ from ucfrec.off_policy.ab_test import Comparison
 from ucfrec.off_policy.estimators import LOGGED, SUITE
 from ucfrec.reporting.tables import Table, format_value
 from ucfrec.results.charts import Chart, Interval, interval_chart
+from ucfrec.results.evidence import Evidence
 from ucfrec.results.rows import ResultRow, name_rows, read_results, select_intervals
 from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.record import UpdateVerdict
@@ -141,7 +142,7 @@ def _conclude_rows(place: str, rows: Sequence[ResultRow]) -> Finding:
 def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
     """What a JSON object of `ucfrec compare`, of the record of an updated run or of another command
     says."""
-    if "always_low" in values:
+    if "always" in values:
         return _conclude_comparison(TypeAdapter(Comparison).validate_python(values))
     if update := values.get("update"):
         return conclude_update(update["of"], UpdateVerdict.model_validate(update["verdict"]))
@@ -151,25 +152,25 @@ def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
 
 def _conclude_comparison(test: Comparison) -> Finding:
     """What an A/B test says."""
-    planned, always = (test.low, test.high), (test.always_low, test.always_high)
-    intervals = [
-        Interval(when, test.difference, low, high)
-        for when, (low, high) in (("as planned", planned), ("whenever looked at", always))
-        if low is not None and high is not None
-    ]
+    named = {"as planned": test.planned, "whenever looked at": test.always}
+    intervals = _list_intervals(named)
     first, second = test.arms
     title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
     chart = interval_chart(title, intervals, ("no difference", 0.0))
-    remarks = str(test).splitlines()
+    remarks = str(test).splitlines()[1:]
     return Finding(f"The A/B test of {first} and {second}", test.conclusion, (), remarks, chart)
+
+
+def _list_intervals(named: Mapping[str, Evidence]) -> list[Interval]:
+    return [
+        Interval(name, entry.value or 0.0, *(entry.interval or (0.0, 0.0)), entry.is_reliable)
+        for name, entry in named.items()
+    ]
 
 
 def conclude_update(of: str, verdict: UpdateVerdict) -> Finding:
     """What the newest rows say of an updated run against the one `of` before."""
-    intervals = [
-        Interval(row.measure, row.value, row.low, row.high, not row.doubt)
-        for row in verdict.differences
-    ]
+    intervals = _list_intervals(verdict.differences)
     title = f"Updated run less {of}, with 95% intervals; grey: the data cannot say"
     answer, *remarks = describe(verdict).splitlines()
     chart = interval_chart(title, intervals, ("no difference", 0.0))

@@ -54,7 +54,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
 
     Raises:
         InputError: the run is a link, not finished or damaged, or, without `force`, is not an
-            update of the current run or worse than that.
+            update of the current run, or reliably worse by any measure.
     """
     if run.is_symlink():
         raise InputError(
@@ -103,8 +103,8 @@ def _require_verdict(run: Path, pointer: Promoted) -> None:
         fault = f"has no verdict against the current run {current.name}"
     elif update.run != TrainedPolicy.load(current, split=True).fingerprint:
         fault = f"was compared with {update.of}, not with the current run {current.name}"
-    elif update.verdict.result == "worse":
-        fault = f"is worse than {current.name} by its verdict"
+    elif harms := update.verdict.harms:
+        fault = f"is worse than {current.name}: {harms}"
     if fault:
         raise InputError(f"{run} {fault}; compare them, and add --force to promote it all the same")
     pointer.require_same(TrainedPolicy.load(current))

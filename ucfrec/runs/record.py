@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import Evidence, RuleRecord
+from ucfrec.choosing.choice import RuleEvidence, RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
@@ -30,6 +30,7 @@ from ucfrec.files.atomic import read_json
 from ucfrec.files.record import RUN_RECORD, SMALL, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
+from ucfrec.results.evidence import Evidence, Standing
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
@@ -102,40 +103,33 @@ class Candidate(Entry):
     rule: SavedRule
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
-    evidence: Evidence | None = None
-
-
-class Difference(Entry):
-    """What the newest rows say of a new run against the old one, by one measure."""
-
-    measure: Text
-    value: Number
-    """Of the new run less that of the old one."""
-    low: Number
-    """Ends of the 95% interval, over users."""
-    high: Number
-    doubt: Text = ""
-    """Why not to rely on it; empty if nothing is found."""
-
-    @property
-    def sign(self) -> int:
-        """1 if it shows that the new run is better, −1 that it is worse, 0 neither."""
-        return 0 if self.doubt else int(self.low > 0) - int(self.high < 0)
-
-
-UpdateResult: TypeAlias = Literal["better", "no significant difference", "worse"]
+    evidence: RuleEvidence | None = None
 
 
 class UpdateVerdict(Entry):
     """Whether a new run is better than the old one (`ucfrec.updating.verdict`)."""
 
-    result: UpdateResult
     decided_by: Text
     """The measure that decides."""
-    differences: tuple[Difference, ...]
+    differences: dict[Text, Evidence]
+    """By each measure, what the newest rows say of the new run against the old one."""
     steps: Count
     """Rows that the runs are compared on, which neither was trained on."""
     users: Count
+
+    @property
+    def harms(self) -> str:
+        """The measures by which the new run is reliably worse, with their evidence; "" for none."""
+        return "; ".join(
+            f"{measure} {evidence.format()}"
+            for measure, evidence in self.differences.items()
+            if evidence.standing() == "worse"
+        )
+
+    @property
+    def result(self) -> Standing:
+        """Worse if it harms any measure, else what the deciding one shows."""
+        return "worse" if self.harms else self.differences[self.decided_by].standing()
 
 
 class Update(Entry):

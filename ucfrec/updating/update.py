@@ -34,6 +34,9 @@ class UpdateOptions:
     refit: bool = True
     """Go on learning from the newest rows, too, once the runs are compared; see
     `ucfrec.runs.refit`."""
+    allow_argmax: bool = False
+    """Let a decision rule that draws items become one that takes the best, after which new logs
+    have no propensities to evaluate from."""
 
 
 @random_state_kept()
@@ -91,6 +94,9 @@ def update_run(
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
     config, seed = warm_settings(full), options.seed
     config = replace(config, seed=config.seed if seed is None else seed)
+    if (temperature := trained.rule.temperature) > 0 and not options.allow_argmax:
+        drawing = tuple(value for value in config.rule.temperatures if value > 0)
+        config = replace(config, rule=replace(config.rule, temperatures=drawing or (temperature,)))
     update = Update(
         of=run.resolve().name,
         run=trained.fingerprint,

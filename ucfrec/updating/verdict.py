@@ -1,6 +1,7 @@
 """Whether an updated run is better than the one before, on rows that neither was trained on."""
 
-from typing import Any, Final, get_args
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -10,10 +11,11 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.states import liked_rewards
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_intervals
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import score_steps
-from ucfrec.off_policy.verdict import OTHERS_REMOVED, check_mean_weight
-from ucfrec.results.statistics import effective_number
-from ucfrec.runs.record import Difference, UpdateResult, UpdateVerdict
+from ucfrec.off_policy.verdict import diagnose, list_reasons
+from ucfrec.results.evidence import Evidence
+from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_report import (
     RewardRows,
@@ -27,9 +29,6 @@ from ucfrec.user_model.reward_report import (
 RANKING: Final = "ndcg_liked"
 VALUE: Final = "reward per step"
 _K = 10
-_LEAST_STEPS = 30
-"""Effective steps below which weights say nothing."""
-_SEEN_REMOVED = "as where it was served without seen items: update with --filter-seen"
 
 
 def compare_runs(
@@ -41,8 +40,8 @@ def compare_runs(
     """Compare two runs, each under its own rule.
 
     Where steps have propensities, the difference in reward per step decides, under the logging
-    policy's distribution of histories, and nothing if that is not reliable: rankings of logged
-    clicks favour whoever showed them. Else the difference in nDCG of liked items decides.
+    policy's distribution of histories; else that in nDCG of liked items. With propensities nDCG
+    weights clicks as if items were shown uniformly, as they favour the run that showed them.
 
     Args:
         new: trained on a store that was grown from that of `old`.
@@ -55,26 +54,44 @@ def compare_runs(
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, newest)
     old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), newest)
-    gained = (new_gain - old_gain) * liked
-    differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
+    propensity = np.full(len(reward), np.nan)
     if schema.PROPENSITY in rows.record.columns:
         propensity = rows.column(schema.PROPENSITY).astype(np.float64)
-        if (weighed := propensity > 0).any():
-            probabilities = np.stack([new_probability, old_probability], axis=1)
-            weights = probabilities[weighed] / propensity[weighed, None]
-            earned, owner = reward[weighed].astype(np.float64), user[weighed]
-            # The mean reward is a control variate: weights of both policies have mean 1.
-            lift = (weights[:, 0] - weights[:, 1]) * (earned - earned.mean())
-            doubt = _doubt(weights, owner, schema.EXCLUDES_SEEN in rows.record.columns)
-            differences.append(_compare(VALUE, lift, np.ones(len(lift)), owner, seed, doubt))
-    decisive = differences[-1]
+    weighed = np.flatnonzero(propensity > 0)
+    # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
+    shown = np.where(propensity > 0, propensity, np.inf) if len(weighed) else np.ones(len(reward))
+    likes = liked / shown
+    counted, faults = np.flatnonzero(likes), list[str]()
+    if len(counted):
+        target = np.full(len(counted), 1 / np.mean(1 / shown[counted]))
+        faults = list_reasons(
+            diagnose(_cut_rows(likes[counted], shown[counted], target, user[counted]))
+        )
+    differences = {RANKING: _compare((new_gain - old_gain) * likes, likes, user, seed, faults)}
+    if len(weighed):
+        returns, owner = reward[weighed].astype(np.float64), user[weighed]
+        new_steps, old_steps = (
+            _cut_rows(returns, propensity[weighed], probability[weighed].clip(0, 1), owner)
+            for probability in (new_probability, old_probability)
+        )
+        faults = [f"the new run: {reason}" for reason in list_reasons(diagnose(new_steps))]
+        faults += [f"the old run: {reason}" for reason in list_reasons(diagnose(old_steps))]
+        # The mean reward is a control variate: weights of both policies have mean 1.
+        lift = (new_steps.weights - old_steps.weights) * (returns - returns.mean())
+        differences[VALUE] = _compare(lift, np.ones(len(lift)), owner, seed, faults)
     return UpdateVerdict(
-        result=get_args(UpdateResult)[1 - decisive.sign],
-        decided_by=decisive.measure,
-        differences=tuple(differences),
+        decided_by=[*differences][-1],
+        differences=differences,
         steps=rows.n_steps,
         users=len(np.unique(user)),
     )
+
+
+def _cut_rows(
+    reward: Float64Array, propensity: Float64Array, target: Float64Array, user: IntArray
+) -> LoggedSteps:
+    """Rows (N,), each a session of its own."""
+    return LoggedSteps(np.arange(len(reward)), reward, propensity, target, user=user)
 
 
 def describe(verdict: UpdateVerdict) -> str:
@@ -83,11 +100,9 @@ def describe(verdict: UpdateVerdict) -> str:
         f"verdict       {verdict.result}, by {verdict.decided_by} on the newest {verdict.steps:,} "
         f"rows of {verdict.users:,} users"
     ]
-    for row in verdict.differences:
-        side = ("open", "for", "against")[row.sign]
-        doubt = f"; not reliable: {row.doubt}" if row.doubt else ""
-        interval = f"{row.value:+.4g} [{row.low:+.4g}, {row.high:+.4g}]"
-        lines.append(f"  {side:<11} {row.measure} {interval}{doubt}")
+    for measure, evidence in verdict.differences.items():
+        reasons = f" ({evidence.reasons[0]})" if evidence.reasons else ""
+        lines.append(f"  {evidence.standing():<11} {measure} {evidence.format('+.4g')}{reasons}")
     return "\n".join(lines)
 
 
@@ -111,38 +126,24 @@ def _judge_items(
 
 
 def _compare(
-    measure: str,
     above: Float64Array,
     below: Float64Array,
     user: IntArray,
     seed: int,
-    doubt: str = "",
-) -> Difference:
+    reasons: Sequence[str] = (),
+) -> Evidence:
     """The ratio of sums over steps (N,), with its interval over users."""
     low = high = value = float(above.sum() / (below.sum() or 1))
     users = len(np.unique(user[below > 0]))
     if users < FEWEST_USERS:
-        doubt = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
+        few = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
+        reasons = [few, *reasons]
     (interval,) = cluster_intervals(above[:, None], below[:, None], user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high
-    elif value and not doubt:
-        doubt = "the users do not differ enough"
-    return Difference(measure=measure, value=value, low=low, high=high, doubt=doubt)
-
-
-def _doubt(weights: Float64Array, user: IntArray, filter_seen: bool) -> str:
-    """Why not to rely on weights (N, 2) of the new and the old run; empty if nothing is found."""
-    for name, column in zip(("new", "old"), weights.T, strict=True):
-        test = check_mean_weight(f"the {name} run", column, user)
-        if not test.passed:
-            cause = OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
-            return (
-                f"{test} where 1 is expected: the log lacks its choices ({cause}), or propensities "
-                "are wrong"
-            )
-    effective = min(effective_number(column) for column in weights.T)
-    return f"the weights leave {effective:.0f} effective steps" if effective < _LEAST_STEPS else ""
+    elif value and not reasons:
+        reasons = ["the users do not differ enough"]
+    return Evidence(value, low, high, tuple(reasons))
 
 
 _GROUPS = 10
@@ -175,25 +176,10 @@ def popularity_index(old: Array, new: Array) -> float:
 
 def reward_index(old: Float64Array, new: Float64Array) -> float:
     """`stability_index` of rewards in groups between deciles of the old ones."""
-    edges = np.unique(
-        np.quantile(
-            old,
-            np.linspace(
-                0,
-                1,
-                _GROUPS + 1,
-            )[1:-1],
-            method="lower",
-        )
-    )
-    counts = [
-        np.bincount(
-            np.searchsorted(edges, x),
-            None,
-            len(edges) + 1,
-        )
-        for x in (old, new)
-    ]
+    deciles = np.linspace(0, 1, _GROUPS + 1)[1:-1]
+    edges = np.unique(np.quantile(old, deciles, method="lower"))
+    groups = [np.searchsorted(edges, rewards) for rewards in (old, new)]
+    counts = [np.bincount(group, minlength=len(edges) + 1) for group in groups]
     return stability_index(counts[0], counts[1])
 
 

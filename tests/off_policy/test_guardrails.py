@@ -1,0 +1,68 @@
+"""Guardrails hold, break or stay open by their interval; intervals of groups hold at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.off_policy.test_verdict import ITEMS, TARGET, logs
+from ucfrec.errors import InputError
+from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
+from ucfrec.results.evidence import Evidence
+
+DWELL = np.linspace(2.0, 1.0, ITEMS)
+"""Of which later items, which the policy prefers, have less."""
+CHANGE = float(TARGET @ DWELL / DWELL.mean() - 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "outcome"),
+    [
+        ("dwell >= -30%", "holds"),
+        ("dwell >= -5%", "broken"),
+        ("dwell <= -5%", "holds"),
+        ("dwell <= -30 %", "broken"),
+        (f"dwell >= {100 * CHANGE:.4f}%", "open"),
+    ],
+)
+def test_a_guardrail_is_checked_by_the_interval_of_the_change(text: str, outcome: str) -> None:
+    steps, items = logs(4000)
+    guardrail = check_guardrail(text, DWELL[items], steps, (), 0)
+    assert guardrail.measure == "dwell"
+    assert guardrail.change.low < CHANGE < guardrail.change.high
+    assert guardrail.outcome == outcome
+    assert str(guardrail).endswith(outcome)
+    doubted = check_guardrail(text, DWELL[items], steps, ("too few users",), 0)
+    assert doubted.outcome == "open"
+    assert "dwell: –" in str(doubted)
+    assert "not above 0" in str(check_guardrail(text, -DWELL[items], steps, (), 0))
+
+
+@pytest.mark.parametrize("text", ["dwell", "dwell >= -2", ">= -2%", "dwell > -2%"])
+def test_a_guardrail_is_written_with_a_bound_in_percent(text: str) -> None:
+    with pytest.raises(InputError, match=r"write e\.g\. 'dwell_seconds >= -2%'"):
+        Guardrail.parse(text)
+
+
+@pytest.mark.parametrize("of_items", [False, True])
+def test_groups_add_up_and_their_intervals_are_wider(of_items: bool) -> None:
+    steps, items = logs(6000)
+    lifts = steps.session_weights * steps.returns - steps.returns
+    number = items % 2 if of_items else np.where(np.arange(6000) < 100, 2, np.arange(6000) % 2)
+    groups = Groups(("even", "odd", "few"), number, of_items)
+    even, odd, few = compare_groups(groups, steps, lifts, 0)
+    if of_items:
+        assert few.difference.reasons == (
+            "no session has both weight and reward: the logs support no estimate",
+        )
+        total = even.difference.value + odd.difference.value
+        assert total == pytest.approx(lifts.mean(), abs=0.02)
+    else:
+        assert few.difference.low is None
+        assert "effective of 100 users (below 200)" in str(few)
+        mean = lifts[number == 0].mean()
+        assert even.difference.value == pytest.approx(mean)
+        width = even.difference.high - even.difference.low
+        assert width > 2 * 2.1 * lifts[number == 0].std() / even.users**0.5
+    assert isinstance(odd.difference, Evidence)
+    assert replace(groups, names=()).number is number

@@ -52,7 +52,6 @@ class Ope(RuleOptions, LogOptions):
     details: bool = False
     """Also print all estimates, and what was read."""
     discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
-    pages: Annotated[bool, _ESTIMATED] = False
     reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean

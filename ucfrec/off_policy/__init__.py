@@ -11,7 +11,7 @@ The array functions need no ucfrec run, and do not load torch:
 
 from ucfrec.off_policy.answer import Verdict, conclude
 from ucfrec.off_policy.estimators import Estimate, estimate
-from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled, as_pages
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled, merge_lists
 from ucfrec.off_policy.selection import select
 from ucfrec.off_policy.verdict import diagnose
 
@@ -21,9 +21,9 @@ __all__ = [
     "LoggedSteps",
     "Modelled",
     "Verdict",
-    "as_pages",
     "conclude",
     "diagnose",
     "estimate",
+    "merge_lists",
     "select",
 ]

@@ -15,8 +15,6 @@ w_i that of the whole session, E_n the mean over sessions.
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
-| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.logged_steps` |
-| SNIIPS | the same with ρ_it over its mean at position t | |
 
 Estimators that shrink large weights take a little bias for much less variance. Each is
 E_n[v + ŵ (r − q)], with q = v = 0 for the IPS kinds, and ŵ(w; λ) for the weight w:
@@ -56,8 +54,6 @@ LOGGED: Final = "logged"
 _OF_MODEL = "only as good as its model, whose error no resampling shows"
 _OF_GROUPS = "right only if the reward of an item depends on its group alone"
 _OF_SHRINKING = "its shrunk weights have an error that no resampling shows"
-_LEAST_RATIO = 1e-12
-"""Mean ratio of a position below which nothing is divided by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +104,7 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     if steps.model is not None:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
         terms["DM"] = Terms(modelled, ones, ones, doubt=_OF_MODEL)
-        if not steps.pages:
-            terms["FQE"] = Terms(steps.model.v[steps.first], ones, ones, doubt=_OF_MODEL)
+        terms["FQE"] = Terms(steps.model.v[steps.first], ones, ones, doubt=_OF_MODEL)
     estimates = summarise(terms, steps.user, seed)
     if not steps.lacking.all() and (terms := session_terms(steps.weighable)):
         estimates |= summarise(terms, steps.weighable.user, seed)
@@ -146,20 +141,21 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         per_decision = steps.per_session(steps.discounts * weights * steps.reward)
     if by_step is None:
         by_step = estimate_by_step(steps)
-    terms = {
-        "IPS": Terms(last * steps.returns, ones, last),
-        "SNIPS": Terms(last * steps.returns, last, last),
-        "PDIS": Terms(per_decision, ones, last),
-        "SNPDIS": Terms(by_step, ones, last),
-    }
+    terms = {"PDIS": Terms(per_decision, ones, last), "SNPDIS": Terms(by_step, ones, last)}
     if steps.model is not None:
-        left = steps.reward - steps.model.q
-        corrected = weights * left + steps.shift(weights) * steps.model.v
+        q, v = steps.model.q, steps.model.v
+        if steps.positions == "independent":
+            # What follows at other positions is no business of this one.
+            q, v = steps.model.logged_reward, steps.model.reward
+        left = steps.reward - q
+        corrected = weights * left + steps.weights_before * v
         terms["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
-        by_step = normalise_by_step(steps, left, steps.model.v, StepSums.of(steps, left))
+        by_step = normalise_by_step(steps, left, v, StepSums.of(steps, left))
         terms["SNDR"] = Terms(by_step, ones, last)
-    if steps.pages:
-        terms |= _page_terms(steps)
+    if steps.place is not None:
+        return terms
+    terms["IPS"] = Terms(last * steps.returns, ones, last)
+    terms["SNIPS"] = Terms(last * steps.returns, last, last)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         terms["MIPS"] = Terms(above, ones, clustered[steps.last], doubt=_OF_GROUPS)
@@ -172,24 +168,6 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         shrunk = shrink(last, parameter)
         doubt = _OF_SHRINKING if (shrunk != last).any() else ""
         terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, doubt)
-    return terms
-
-
-def _page_terms(steps: LoggedSteps) -> dict[str, Terms]:
-    """Those of the independent model, in which a page counts its mean ratio."""
-    ratios, ones = steps.target / steps.propensity, np.ones(len(steps.first))
-    rewards = steps.discounts * ratios * steps.reward
-    counts = steps.per_session(ratios) / steps.lengths
-    terms = {"IIPS": Terms(steps.per_session(rewards), ones, counts)}
-    # Means over pages, by position, of ρ, of ρ r γ^t over it, and of there being such a position.
-    below = np.bincount(steps.step, ratios) / len(ones)
-    if (below > _LEAST_RATIO).all():
-        mean = np.bincount(steps.step, rewards) / len(ones) / below
-        positions = np.bincount(steps.step) / len(ones)
-        # The estimate Σ_t positions_t mean_t, plus each page's influence on it.
-        beyond = (steps.discounts * steps.reward - mean[steps.step]) * ratios
-        influence = (positions / below)[steps.step] * beyond + mean[steps.step]
-        terms["SNIIPS"] = Terms(steps.per_session(influence), ones, counts)
     return terms
 
 
@@ -298,7 +276,7 @@ def normalise_by_step(
     value, start = float(rewarded.sum()), 0.0
     if v is not None:
         totals_before = np.append(float(sessions), totals[:-1])
-        earlier = steps.shift(weights)
+        earlier = steps.weights_before
         valued = by_step * np.bincount(step, earlier * v) / totals_before
         mine = mine + steps.discounts * earlier * v / totals_before[step]
         slopes[:-1] += (valued / totals_before)[1:]

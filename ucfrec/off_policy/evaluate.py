@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from ucfrec.off_policy.answer import (
 )
 from ucfrec.off_policy.estimators import LOGGED, SUITE, Estimate, estimate, session_terms
 from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
-from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, as_pages, number_pages
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Positions, merge_lists
 from ucfrec.off_policy.models import (
     InputsFile,
     ModelReport,
@@ -41,6 +41,7 @@ from ucfrec.off_policy.verdict import (
     ENOUGH_USERS,
     FAR_OFF,
     MOST_LEFT_OUT,
+    Diagnosis,
     check_catalogue_size,
     diagnose,
 )
@@ -60,8 +61,6 @@ class EstimateOptions:
 
     discount: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Discount factor γ of the estimated returns."""
-    pages: bool = False
-    """Estimate the return of a page: its positions are sessions of one step, within 10 ms."""
     users_known: bool = True
     """Whether users are persons; if not, each session is taken to be of another user."""
     reward_range: tuple[float, float] | None = None
@@ -91,6 +90,12 @@ class EstimateOptions:
 
 
 DEFAULTS = EstimateOptions()
+ASSUMPTIONS: Final[Mapping[Positions, str]] = {
+    "whole list": "the whole list",
+    "cascade": "the item and those above it",
+    "independent": "the item alone",
+}
+"""What the reward of an item in a list depends on, in words."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -107,7 +112,7 @@ class OffPolicyReport(ResultTable):
     models: ModelReport | None
     """How good the models of DM, FQE and DR are; None from scored rows."""
     returns: Float64Array
-    """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
+    """(S,) of the logged sessions with all their propensities; empty if none has."""
     user: IntArray | None
     """(S,) whose they are; None where each is of another user."""
     terms: Float64Array | None
@@ -180,8 +185,7 @@ def evaluate_off_policy(
     alone, read with `keep_unknown`: a step of an unknown item has weight 0.
 
     Raises:
-        InputError: propensities are not probabilities, there is only one user, or a page would have
-            a session of several steps.
+        InputError: propensities are not probabilities, or there is only one user.
     """
     if {*options.measures} != {*logged.measures} or (options.by and logged.groups is None):
         raise InputError("--guardrail and --by read further columns of logs: name the logs")
@@ -197,7 +201,7 @@ def evaluate_off_policy(
     logs = WeighedLogs(
         steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
     )
-    _doubt_logs(logs, logged, options.pages)
+    _doubt_logs(logs, logged)
     n_items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, n_items)
     if implied is not None and not implied.passed:
@@ -206,20 +210,16 @@ def evaluate_off_policy(
             f"{implied.error * n_items:,.0f} items to choose from, the run knows {n_items:,}: "
             "propensities are too small"
         )
-    if options.pages:
-        page, position = _find_pages(logged)
-        steps = as_pages(steps, page, position)
-    else:
-        # The quarter of the logs, 1 to 4 by time, in which each session begins.
-        times = store.column(schema.TIMESTAMP)[steps.first]
-        quartiles = np.quantile(times, [0.25, 0.5, 0.75])
-        logs.segment = 1 + np.searchsorted(quartiles, times, side="right")
-        logs.traffic = Traffic(
-            days=float(np.ptp(times)) / DAY_MS,
-            users=len(np.unique(steps.users)),
-            steps=len(steps.reward),
-            draws=concentration * n_items,
-        )
+    # The quarter of the logs, 1 to 4 by time, in which each session begins.
+    times = store.column(schema.TIMESTAMP)[steps.first]
+    quartiles = np.quantile(times, [0.25, 0.5, 0.75])
+    logs.segment = 1 + np.searchsorted(quartiles, times, side="right")
+    logs.traffic = Traffic(
+        days=float(np.ptp(times)) / DAY_MS,
+        users=len(np.unique(steps.users)),
+        steps=len(steps.reward),
+        draws=concentration * n_items,
+    )
     clusters = steps.cluster_weights
     if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
         # The estimated probabilities of groups are not good enough for sessions of this length.
@@ -255,20 +255,11 @@ def make_report(
     """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
     mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
     """
-    steps, model = logs.steps, logs.models
-    diagnosis = diagnose(steps, options.reward_range, logs.segment)
-    verdict = conclude(
-        steps,
-        seed,
-        diagnosis,
-        wanted_lift=options.wanted_lift,
-        forbidden=logs.forbidden,
-        declared=logs.declared,
-        days=logs.traffic.days,
-    )
+    rows, model = logs.steps, logs.models
+    steps, diagnosis, verdict = _conclude_lists(logs, seed, options)
     single, traffic = cut_to_steps(steps), logs.traffic
     of_steps: dict[str, Estimate] = {}
-    if not verdict.lift.is_reliable and not options.pages:
+    if not verdict.lift.is_reliable:
         plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
         verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
         if single is not None:
@@ -281,10 +272,10 @@ def make_report(
         terms = session_terms(weighable)[verdict.estimator].influences
         if logs.groups is not None:
             lifts = terms - weighable.returns
-            groups = compare_groups(logs.groups, steps, lifts, seed)
+            groups = compare_groups(logs.groups, rows, lifts, seed)
             verdict = replace(verdict, groups=groups)
     guardrails = [
-        check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
+        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
         for text, measure in zip(options.guardrails, options.measures, strict=True)
     ]
     verdict = replace(verdict, guardrails=guardrails)
@@ -312,7 +303,7 @@ def make_report(
         conditions={
             "run": shorten_paths(str(trained.folder)),
             "discount": options.discount,
-            "pages": options.pages,
+            "positions": steps.positions if rows.place is not None else None,
             "anonymous": not options.users_known,
             "sessions": len(steps.first),
             "steps": logs.rows,
@@ -338,6 +329,48 @@ def make_report(
             replace(base, table="per step", metric="R_step"), of_steps, rule, judged
         ),
     )
+
+
+def _conclude_lists(
+    logs: WeighedLogs,
+    seed: int,
+    options: EstimateOptions,
+) -> tuple[LoggedSteps, Diagnosis, Verdict]:
+    """The steps as the weakest assumption on the positions of lists has them of which the logs have
+    enough, or else as a cascade; with what is concluded under it, beside what is under others.
+
+    Independent positions never decide: given the items above it, the ratio of a position leaves out
+    how those change what is left to show, so that its interval covers too seldom.
+    """
+    steps, results = logs.steps, list[tuple[LoggedSteps, Diagnosis, Verdict]]()
+    ways = [steps]
+    if steps.place is not None:
+        ways = [merge_lists(steps), steps, replace(steps, positions="independent")]
+    for way in ways:
+        diagnosis = diagnose(way, options.reward_range, logs.segment)
+        verdict = conclude(
+            way,
+            seed,
+            diagnosis,
+            wanted_lift=options.wanted_lift,
+            forbidden=logs.forbidden,
+            declared=logs.declared,
+            days=logs.traffic.days,
+        )
+        results.append((way, diagnosis, verdict))
+    deciding = results[:2]
+    chosen = next((result for result in deciding if result[2].lift.is_reliable), deciding[-1])
+    if len(results) > 1:
+        others = "; ".join(
+            f"{ASSUMPTIONS[way.positions]}: {verdict.lift.format()}"
+            for way, _, verdict in results
+            if way is not chosen[0]
+        )
+        logs.remarks.append(
+            f"decisions are lists: rewards depend on {ASSUMPTIONS[chosen[0].positions]}; if they "
+            f"depend on {others}"
+        )
+    return chosen
 
 
 def _make_rows(
@@ -366,7 +399,7 @@ def _make_rows(
     return rows
 
 
-def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions, pages: bool) -> None:
+def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions) -> None:
     """Add what rows seen in training, of unknown items, and dropped rows say."""
     seen, dropped = logs.columns["seen_in_training"], logged.report["dropped"]
     logs.forbidden += seen_too_often(seen)
@@ -388,23 +421,6 @@ def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions, pages: bool) -> None:
             f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
             + ", and may differ from the rest" * much
         )
-    if pages and (repeated := dropped.get("duplicate", 0)):
-        logs.remarks.append(
-            f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "
-            "page can show an item twice, log its positions a millisecond apart"
-        )
-
-
-def _find_pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
-    """(N,) page of each step, and its position there where the observation is one-hot."""
-    store = logged.store
-    users = np.unique(logged.users, return_inverse=True)[1][store.all_steps()[0]]
-    page = number_pages(users, store.column(schema.TIMESTAMP).astype(np.int64))
-    if store.observation_size < 2:
-        return page, None
-    observations = store.column(schema.OBSERVATION)
-    one_hot = np.isin(observations, (0, 1)).all() and (observations.sum(axis=1) == 1).all()
-    return page, observations.argmax(axis=1) if one_hot else None
 
 
 def collect_steps(
@@ -421,12 +437,16 @@ def collect_steps(
     propensity = np.full(store.n_steps, np.nan)
     if schema.PROPENSITY in store.record.columns:
         propensity = store.column(schema.PROPENSITY).astype(np.float64)
+    place = None
+    if schema.PLACE in store.record.columns:
+        place = store.column(schema.PLACE).astype(np.int64)
     # What the logs say without any policy is checked before the slow scoring.
     plain = LoggedSteps(
         session=store.all_steps()[0],
         reward=store.column(schema.REWARD).astype(np.float64),
         propensity=propensity,
         target=np.zeros(store.n_steps),
+        place=place,
         user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
         discount=options.discount,
     )

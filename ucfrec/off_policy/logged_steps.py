@@ -1,23 +1,26 @@
-"""Logged steps as flat arrays, the importance weights that follow from them, and pages.
+"""Logged steps as flat arrays, the importance weights that follow from them, and lists.
 
 Notation of the whole package: session i of S, step t (from 0) of its T_i steps; ρ_it =
 target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,−1 = 1; γ the discount.
 
-The steps of a page are its positions, chosen at once. Its weights follow from how its positions are
-assumed to influence each other (McInerney, Brost, Chandar, Mehrotra & Carterette, KDD 2020):
+Where decisions are lists, the steps are their positions, and ρ_it is given the items before it in
+the list. What the positions of a decision weigh follows from how they are assumed to influence each
+other (McInerney, Brost, Chandar, Mehrotra & Carterette, KDD 2020), after w of all earlier
+decisions:
 
-| model of the reward at a position | depends on the items at | weight | estimates |
-|---|---|---|---|
-| independent | this position | ρ_it | IIPS, SNIIPS (Li et al., KDD 2018) |
-| cascade | this position and those before it | w_it = Π_{k ≤ t} ρ_ik | PDIS (their RIPS), SNPDIS |
-| slate | all positions | w_i = Π_k ρ_ik | IPS, SNIPS |
+| `positions` | the reward at a position depends on the items at | weight |
+|---|---|---|
+| independent | this position | ρ_it (Li et al., KDD 2018) |
+| cascade | this position and those before it | Π_{k ≤ t} ρ_ik of the list |
+| whole list | all positions | Π_k ρ_ik of the list |
 
-Each model contains the one above it: a weaker assumption, and heavier weights.
+Each model contains the one above it: a weaker assumption, and heavier weights. `merge_lists` turns
+lists into single steps, for the last one.
 """
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Final
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -26,10 +29,11 @@ from ucfrec.errors import InputError
 
 _LARGEST = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
+_SMALLEST = 1e-300
+"""Probability of a list from which on it is above 0 in float64."""
 _ROUNDING = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
-PAGE_MS: Final = 10
-"""Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""
+Positions: TypeAlias = Literal["whole list", "cascade", "independent"]
 _TARGETS = ("target", "cluster_target")
 _PROBABILITIES = ("propensity", "cluster_propensity", *_TARGETS)
 _COLUMNS = ("reward", *_PROBABILITIES, "per_decision", "by_step")
@@ -97,8 +101,11 @@ class LoggedSteps:
     """(N,) terms of PDIS, where steps are sums of whole sessions (`ucfrec.off_policy.scored`)."""
     by_step: Float64Array | None = None
     """(N,) those of SNPDIS."""
-    pages: bool = False
-    """Whether a session is one page and its steps the page's positions (`as_pages`)."""
+    place: IntArray | None = None
+    """(N,) position of each step in the list of its decision, from 0; None where every step is a
+    decision."""
+    positions: Positions = "cascade"
+    """How the positions of a list influence each other."""
 
     def __post_init__(self) -> None:
         replace_field = partial(object.__setattr__, self)
@@ -120,7 +127,7 @@ class LoggedSteps:
             replace_field("user", _number_users(self.user))
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
             raise InputError("give both cluster_propensity and cluster_target, or neither")
-        columns = [(name, getattr(self, name)) for name in _COLUMNS]
+        columns = [(name, getattr(self, name)) for name in (*_COLUMNS, "place")]
         for part in (self.model, self.groups):
             columns += vars(part).items() if part else ()
         for name, values in columns:
@@ -168,9 +175,19 @@ class LoggedSteps:
         return np.split(order, np.cumsum(np.bincount(self.step))[:-1])
 
     @cached_property
+    def decision(self) -> IntArray:
+        """(N,) number of each step's decision, from 0."""
+        if self.place is None:
+            return np.arange(len(self.session))
+        begins = self.place == 0
+        begins[self.first] = True
+        return np.cumsum(begins) - 1
+
+    @cached_property
     def discounts(self) -> Float64Array:
-        """(N,) γ^t."""
-        return np.asarray(self.discount**self.step, dtype=np.float64)
+        """(N,) γ^t, with t the number of the decision in its session."""
+        number = self.decision - self.decision[self.first][self.session]
+        return np.asarray(self.discount**number, dtype=np.float64)
 
     @cached_property
     def returns(self) -> Float64Array:
@@ -180,12 +197,25 @@ class LoggedSteps:
     @cached_property
     def weights(self) -> Float64Array:
         """(N,) w_it; NaN from a step without propensity on."""
-        return self._multiply(self.target / self.propensity)
+        ratios = self.target / self.propensity
+        if self.place is None or self.positions == "cascade":
+            return self._multiply(ratios)
+        return self._weights_before_lists * ratios
+
+    @cached_property
+    def _weights_before_lists(self) -> Float64Array:
+        """(N,) the weight of all decisions before a step's own."""
+        products = self.shift(self._multiply(self.target / self.propensity))
+        starts = np.flatnonzero(np.diff(self.decision, prepend=-1))
+        return products[starts][self.decision]
 
     @cached_property
     def session_weights(self) -> Float64Array:
-        """(S,) w of each session's last step: the product of all its ratios."""
-        return self.weights[self.last]
+        """(S,) w of each session's last step: the product of all its ratios; with lists, the mean
+        weight of its steps."""
+        if self.place is None:
+            return self.weights[self.last]
+        return self.per_session(self.weights) / self.lengths
 
     @cached_property
     def cluster_weights(self) -> Float64Array | None:
@@ -197,6 +227,13 @@ class LoggedSteps:
     def per_session(self, values: Float64Array) -> Float64Array:
         """(S,) sums of values (N,)."""
         return np.add.reduceat(values, self.first)
+
+    @cached_property
+    def weights_before(self) -> Float64Array:
+        """(N,) what weighs the values v_it: w_i,t−1, or that of earlier decisions."""
+        if self.place is None or self.positions == "cascade":
+            return self.shift(self.weights)
+        return self._weights_before_lists
 
     def shift(self, products: Float64Array) -> Float64Array:
         """(N,) w_i,t−1 of products w_it (N,): 1 at the first step."""
@@ -230,7 +267,7 @@ class LoggedSteps:
         """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
         taken: dict[str, Any] = {}
         for name, value in vars(self).items():
-            if name in _COLUMNS and value is not None:
+            if name in (*_COLUMNS, "place") and value is not None:
                 taken[name] = value[rows]
             elif isinstance(value, (Modelled, ItemGroups)):
                 columns = {key: column[rows] for key, column in vars(value).items()}
@@ -303,36 +340,31 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
     return np.asarray(values)
 
 
-def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = None) -> LoggedSteps:
-    """Put sessions of one step each together to pages: a session a page, in order of the numbers of
-    `page`, each of the user of its first step. The evaluated policy's probability of a page is the
-    product of those of the positions. A model of the steps' reward stays, as a control variate.
+def merge_lists(steps: LoggedSteps) -> LoggedSteps:
+    """Every decision as one step: its rewards summed, the probability of its list the product of
+    those of the positions. Models of the return are those of the first position; those of the
+    reward are summed."""
+    starts = np.flatnonzero(np.diff(steps.decision, prepend=-1))
 
-    Args:
-        page: (N,) whose equal numbers mark one page; InputError if a session has several steps.
-        position: (N,) by which the steps of a page are ordered, the cascade's first in front; None
-            for the order of the steps.
-    """
-    if len(steps.first) < len(steps.session):
-        raise InputError(
-            f"only {len(steps.first):,} sessions for {len(steps.session):,} steps: pages are made "
-            "of sessions of one step; prepare the logs with one session a row"
-        )
-    if page.shape != steps.session.shape:
-        raise InputError(f"page has shape {page.shape} for {len(steps.session):,} steps")
-    places = np.zeros(len(page)) if position is None else position
-    order = np.lexsort((places, page))
-    number = np.unique(page[order], return_inverse=True)[1]
-    first = np.flatnonzero(np.diff(number, prepend=-1))
-    user = None if steps.user is None else steps.user[order][first]
-    return replace(steps.regroup(order, number, user), pages=True)
+    def multiply(values: Float64Array) -> Float64Array:
+        return np.asarray(np.multiply.reduceat(values, starts))
 
+    def add(values: Float64Array) -> Float64Array:
+        return np.asarray(np.add.reduceat(values, starts))
 
-def number_pages(user: IntArray, time: IntArray) -> IntArray:
-    """(N,) number of each step's page: rows of one user (N,), each within 10 ms of the one before,
-    by their time (N,) in ms."""
-    order = np.lexsort((time, user))
-    begins = (np.diff(user[order], prepend=-1) != 0) | (np.diff(time[order], prepend=0) > PAGE_MS)
-    page = np.empty(len(order), dtype=np.int64)
-    page[order] = np.cumsum(begins) - 1
-    return page
+    model = steps.model and Modelled(
+        reward=add(steps.model.reward),
+        q=steps.model.q[starts],
+        v=steps.model.v[starts],
+        logged_reward=add(steps.model.logged_reward),
+    )
+    return LoggedSteps(
+        session=steps.session[starts],
+        reward=add(steps.reward),
+        propensity=np.maximum(multiply(steps.propensity), _SMALLEST),
+        target=multiply(steps.target),
+        model=model,
+        user=steps.user,
+        discount=steps.discount,
+        positions="whole list",
+    )

@@ -64,10 +64,10 @@ def evaluate_scored(
         InputError: a file is missing, damaged, has no propensities, was scored by another run or
             rule, or is not in the order of `score`; or the options need the logs.
     """
-    of_steps = (options.pages, options.estimate_propensities, options.guardrails, options.by)
+    of_steps = (options.estimate_propensities, options.guardrails, options.by)
     if any(of_steps) or options.reward_range is not None:
         raise InputError(
-            "pages, estimated propensities, guardrails, groups and a reward range (of single "
+            "estimated propensities, guardrails, groups and a reward range (of single "
             "steps) need the logs; leave --scored out"
         )
     files: list[Path] = []

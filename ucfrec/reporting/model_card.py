@@ -100,7 +100,7 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
     files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_format_rule(row)}"
-    of += ", pages" if row.conditions["pages"] else ""
+    of += ", lists" if row.conditions["positions"] else ""
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
     values = _select_values(row, names) | {"logged": rows[LOGGED].value}

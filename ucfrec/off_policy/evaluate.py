@@ -96,6 +96,9 @@ ASSUMPTIONS: Final[Mapping[Positions, str]] = {
     "independent": "the item alone",
 }
 """What the reward of an item in a list depends on, in words."""
+_ENOUGH_FOR_WHOLE_LISTS = 1000
+"""Effective users from which on intervals of whole lists, whose weights are the heaviest, cover
+(`tests/off_policy/test_lists.py`)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -358,8 +361,8 @@ def _conclude_lists(
             days=logs.traffic.days,
         )
         results.append((way, diagnosis, verdict))
-    deciding = results[:2]
-    chosen = next((result for result in deciding if result[2].lift.is_reliable), deciding[-1])
+    enough = results[0][1].effective_users >= _ENOUGH_FOR_WHOLE_LISTS
+    chosen = results[0 if len(results) == 1 or (enough and results[0][2].lift.is_reliable) else 1]
     if len(results) > 1:
         others = "; ".join(
             f"{ASSUMPTIONS[way.positions]}: {verdict.lift.format()}"

@@ -1,7 +1,6 @@
 """The difference between two runs that shared the users: an A/B test on joined exposures."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Final
 import pandas as pd
 
 from ucfrec import schema
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import bind, engine, explain_errors, wrong_type
 from ucfrec.logs.join import FEEDBACK
@@ -89,11 +88,6 @@ class Comparison:
         return "\n".join([*lines, *map(str, self.guardrails), *map(str, self.groups)])
 
     @property
-    def split_p_value(self) -> float:
-        """Of the χ² test that users were drawn into the arms by the intended shares."""
-        return _test_split(self.in_arm, self.shares[0])
-
-    @property
     def conclusion(self) -> str:
         """What the split of the users, the always-valid interval and the guardrails say."""
         first, second = self.arms
@@ -109,7 +103,9 @@ class Comparison:
         return f"{says}, but a guardrail is {'broken' if 'broken' in outcomes else 'open'}"
 
 
-def _test_split(users: tuple[int, int], share: float) -> float:
+def find_split_p_value(users: tuple[int, int], share: float) -> float:
+    """The p-value of the χ² test that so many users were drawn into two arms, the first with a
+    probability of `share`."""
     expected = sum(users) * share
     off = (users[0] - expected) ** 2 / (expected * (1 - share))
     return math.erfc(math.sqrt(off / 2))
@@ -208,7 +204,6 @@ def compare_arms(
     files = log_files(paths)
     name = first_and_more(files)
     groups = _sum_by_user(files, column, memory_limit)
-    has_user, has_arm = groups["who"], groups[schema.ARM] != ""
     by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
     if len(names) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
@@ -226,36 +221,23 @@ def compare_arms(
     means = _Means.of([valued[arm] for arm in names])
     lacking = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
     if any(lacking):
-        text = (
+        warn_user(
             f"{name}: {column} has no value in {lacking[0]:,} rows of {first} and {lacking[1]:,} "
             f"of {second}, which are left out; write 0 where it is meant"
         )
-        warnings.warn(text, InputNote, stacklevel=2)
-    reasons = []
-    if (p_value := _test_split(in_arm, share)) < MISMATCH:
-        # A difference may then be one of the users (Fabijan et al., KDD 2019).
-        reasons.append(
-            f"sample ratio mismatch: {in_arm[0]:,} and {in_arm[1]:,} users, "
-            f"{in_arm[0] / sum(in_arm):.1%} and {in_arm[1] / sum(in_arm):.1%}, where {share:.1%} "
-            f"and {1 - share:.1%} were intended (p = {p_value:.2g}): users are missing from an arm,"
-            " or name the shares that were intended: --shares A=0.9,B=0.1"
-        )
+    reasons = _doubt_split(in_arm, share)
     planned, always = means.compare(expected, reasons)
-    checked, parts = [], list[GroupDifference]()
+    checked = []
     for guardrail in map(Guardrail.parse, guardrails):
         values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))[1]
-        if min(len(values.get(arm, ())) for arm in names) < 1:
+        if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
         checked.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
+    differences: list[GroupDifference] = []
     if by is not None:
-        members = dict(list(_sum_by_user(files, column, memory_limit, by).groupby("part")))
-        for part, rows in members.items():
-            values = _split_arms(rows)[1]
-            if min(len(values.get(arm, ())) for arm in names):
-                of_part = _Means.of([values[arm] for arm in names])
-                evidence = of_part.compare(expected, reasons, MISS / len(members))[1]
-                parts.append(GroupDifference(str(part), sum(of_part.users), evidence))
-    mixed = groups[has_user & groups["mixed"]]
+        parts = _sum_by_user(files, column, memory_limit, by)
+        differences = _compare_parts(parts, names, expected, reasons)
+    mixed = groups["name"].dropna().unique()
     return Comparison(
         column=column,
         arms=(first, second),
@@ -265,15 +247,42 @@ def compare_arms(
         shares=(share, 1 - share),
         rows=means.rows,
         without_value=(lacking[0], lacking[1]),
-        without_user=int(groups["rows"][~has_user].sum()),
-        without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
-        in_several=len(mixed["name"].unique()),
-        named=tuple(sorted(mixed["name"].unique())[:_NAMED]),
+        without_user=int(groups["rows"][~groups["who"]].sum()),
+        without_arm=int(groups["rows"][groups["who"] & (groups[schema.ARM] == "")].sum()),
+        in_several=len(mixed),
+        named=tuple(sorted(mixed)[:_NAMED]),
         planned=planned,
         always=always,
         guardrails=tuple(checked),
-        groups=tuple(parts),
+        groups=tuple(differences),
     )
+
+
+def _compare_parts(
+    groups: pd.DataFrame, arms: Sequence[str], expected: float | None, reasons: Sequence[str]
+) -> list[GroupDifference]:
+    """The differences in the parts of the rows, with always-valid intervals that hold at once."""
+    parts, differences = list(groups.groupby("part")), []
+    for part, rows in parts:
+        values = _split_arms(rows)[1]
+        if all(len(values.get(arm, ())) for arm in arms):
+            means = _Means.of([values[arm] for arm in arms])
+            evidence = means.compare(expected, reasons, MISS / len(parts))[1]
+            differences.append(GroupDifference(str(part), sum(means.users), evidence))
+    return differences
+
+
+def _doubt_split(users: tuple[int, int], share: float) -> list[str]:
+    """Why a difference may be one of the users (Fabijan et al., KDD 2019), if it may."""
+    p_value, total = find_split_p_value(users, share), sum(users)
+    if p_value >= MISMATCH:
+        return []
+    return [
+        f"sample ratio mismatch: {users[0]:,} and {users[1]:,} users, {users[0] / total:.1%} and "
+        f"{users[1] / total:.1%}, where {share:.1%} and {1 - share:.1%} were intended (p = "
+        f"{p_value:.2g}): users are missing from an arm, or name the shares that were intended: "
+        "--shares A=0.9,B=0.1"
+    ]
 
 
 def _split_arms(groups: pd.DataFrame) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:

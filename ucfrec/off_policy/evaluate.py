@@ -41,6 +41,7 @@ from ucfrec.off_policy.verdict import (
     ENOUGH_USERS,
     FAR_OFF,
     MOST_LEFT_OUT,
+    Diagnosis,
     check_catalogue_size,
     diagnose,
 )
@@ -261,37 +262,11 @@ def make_report(
     """
     steps, model = logs.steps, logs.models
     diagnosis = diagnose(steps, options.reward_range, logs.segment)
-    verdict = conclude(
-        steps,
-        seed,
-        diagnosis,
-        wanted_lift=options.wanted_lift,
-        forbidden=logs.forbidden,
-        declared=logs.declared,
-        days=logs.traffic.days,
-    )
-    single, traffic = cut_to_steps(steps), logs.traffic
-    of_steps: dict[str, Estimate] = {}
-    if not verdict.lift.is_reliable and not options.pages:
-        plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
-        verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
-        if single is not None:
-            per_step = conclude(single, seed, forbidden=logs.forbidden)
-            of_steps = add_reasons(estimate(single, seed), per_step.reasons)
-            verdict = replace(verdict, per_step=per_step)
     weighable = None if steps.lacking.all() else steps.weighable
-    terms = None
-    if weighable is not None and verdict.estimator is not None:
-        terms = session_terms(weighable)[verdict.estimator].influences
-        if logs.groups is not None:
-            lifts = terms - weighable.returns
-            groups = compare_groups(logs.groups, steps, lifts, seed)
-            verdict = replace(verdict, groups=groups)
-    guardrails = [
-        check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
-        for text, measure in zip(options.guardrails, options.measures, strict=True)
-    ]
-    verdict = replace(verdict, guardrails=guardrails)
+    verdict, terms = _weigh(logs, diagnosis, seed, options)
+    of_steps: dict[str, Estimate] = {}
+    if verdict.per_step is not None and (single := cut_to_steps(steps)) is not None:
+        of_steps = add_reasons(estimate(single, seed), verdict.per_step.reasons)
     estimates = add_reasons(estimate(steps, seed), verdict.reasons)
     if model is not None and not model.converged:
         diverged = "it diverged: its values exceed the largest possible return"
@@ -343,6 +318,40 @@ def make_report(
             replace(base, table="per step", metric="R_step"), of_steps, rule, judged
         ),
     )
+
+
+def _weigh(
+    logs: WeighedLogs, diagnosis: Diagnosis, seed: int, options: EstimateOptions
+) -> tuple[Verdict, Float64Array | None]:
+    """The verdict with what else was asked for, and (S,) whose mean is the estimate that it is of;
+    where that is not reliable, what single steps show, and what would let the logs say more."""
+    steps, traffic, terms = logs.steps, logs.traffic, None
+    verdict = conclude(
+        steps,
+        seed,
+        diagnosis,
+        wanted_lift=options.wanted_lift,
+        forbidden=logs.forbidden,
+        declared=logs.declared,
+        days=traffic.days,
+    )
+    if verdict.estimator is not None:
+        terms = session_terms(steps.weighable)[verdict.estimator].influences
+        if logs.groups is not None:
+            lifts = terms - steps.weighable.returns
+            verdict = replace(verdict, groups=compare_groups(logs.groups, steps, lifts, seed))
+    guardrails = [
+        check_guardrail(text, logs.measures[measure], steps, verdict.reasons, seed)
+        for text, measure in zip(options.guardrails, options.measures, strict=True)
+    ]
+    verdict = replace(verdict, guardrails=guardrails)
+    if verdict.lift.is_reliable or options.pages:
+        return verdict, terms
+    plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
+    verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
+    if (single := cut_to_steps(steps)) is not None:
+        verdict = replace(verdict, per_step=conclude(single, seed, forbidden=logs.forbidden))
+    return verdict, terms
 
 
 def _make_rows(

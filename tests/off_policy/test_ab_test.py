@@ -130,7 +130,7 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     assert again.low == pytest.approx(once.low)
     pd.concat([frame, both]).to_parquet(tmp_path / "log.parquet")
     found = compare_arms([tmp_path / "log.parquet"])
-    assert (found.in_several, found.named, found.users) == (1, ("1",), (159, 40))
+    assert (found.in_several, found.several_names, found.users) == (1, ("1",), (159, 40))
     assert "1 users were in more than one arm (1); their rows are left out" in str(found)
     named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
     assert named.planned.value == pytest.approx(-found.planned.value)

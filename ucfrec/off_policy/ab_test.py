@@ -55,7 +55,7 @@ class Comparison:
     """Rows of a user without an arm."""
     in_several: int
     """Users who were in more than one arm."""
-    named: tuple[str, ...]
+    several_names: tuple[str, ...]
     """Some of them."""
     planned: Evidence
     """Of the second arm less the first, for a test that ends when it was planned to."""
@@ -74,7 +74,7 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
-        names = ", ".join(self.named) + ", …" * (self.in_several > len(self.named))
+        names = ", ".join(self.several_names) + ", …" * (self.in_several > len(self.several_names))
         left_out = {
             f"rows have no {schema.USER_ID}; they are left out": self.without_user,
             f"rows have no {schema.ARM}; they are left out": self.without_arm,
@@ -140,14 +140,13 @@ class _Means:
     @classmethod
     def of(cls, arms: Sequence[pd.DataFrame]) -> "_Means":
         """Of the users with a value in two arms."""
-        means = [
+        (value_a, error_a), (value_b, error_b) = (
             cluster_mean((arm["value"] / arm["shown"]).to_numpy(), None, arm["shown"].to_numpy())
             for arm in arms
-        ]
-        values, errors = zip(*means, strict=True)
-        sizes = [(len(arm), int(arm["shown"].sum())) for arm in arms]
-        users, rows = zip(*sizes, strict=True)
-        return cls(values, errors, users, rows)
+        )
+        rows_a, rows_b = (int(arm["shown"].sum()) for arm in arms)
+        users = len(arms[0]), len(arms[1])
+        return cls((value_a, value_b), (error_a, error_b), users, (rows_a, rows_b))
 
     def list_faults(self) -> tuple[str, ...]:
         """Why there is no interval."""
@@ -166,8 +165,8 @@ class _Means:
         error = math.sqrt(variance)
         half = NormalDist().inv_cdf(1 - miss / 2) * error
         mixture = expected or EXPECTED * abs(self.values[0]) or error
-        ends = always_valid(value, variance, mixture, miss)
-        return Evidence(value, value - half, value + half), Evidence(value, *ends)
+        low, high = always_valid(value, variance, mixture, miss)
+        return Evidence(value, value - half, value + half), Evidence(value, low, high)
 
     def check(self, guardrail: Guardrail, reasons: Sequence[str]) -> Guardrail:
         """The change of the second arm, as a share of the first."""
@@ -176,8 +175,8 @@ class _Means:
         if faults:
             return replace(guardrail, change=Evidence(None, None, None, faults))
         variance = (error_b / a) ** 2 + (b * error_a / a**2) ** 2
-        ends = always_valid(b / a - 1, variance, EXPECTED)
-        return replace(guardrail, change=Evidence(b / a - 1, *ends))
+        low, high = always_valid(b / a - 1, variance, EXPECTED)
+        return replace(guardrail, change=Evidence(b / a - 1, low, high))
 
 
 def compare_arms(
@@ -219,20 +218,20 @@ def compare_arms(
     of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
     share, in_arm = of_first / (of_first + of_second), (len(by_arm[first]), len(by_arm[second]))
     means = _Means.of([valued[arm] for arm in names])
-    lacking = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
-    if any(lacking):
+    without_value = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
+    if any(without_value):
         warn_user(
-            f"{name}: {column} has no value in {lacking[0]:,} rows of {first} and {lacking[1]:,} "
-            f"of {second}, which are left out; write 0 where it is meant"
+            f"{name}: {column} has no value in {without_value[0]:,} rows of {first} and "
+            f"{without_value[1]:,} of {second}, which are left out; write 0 where it is meant"
         )
     reasons = _doubt_split(in_arm, share)
     planned, always = means.compare(expected, reasons)
-    checked = []
+    results = []
     for guardrail in map(Guardrail.parse, guardrails):
         values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))[1]
         if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
-        checked.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
+        results.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
     differences: list[GroupDifference] = []
     if by is not None:
         parts = _sum_by_user(files, column, memory_limit, by)
@@ -246,14 +245,14 @@ def compare_arms(
         in_arm=in_arm,
         shares=(share, 1 - share),
         rows=means.rows,
-        without_value=(lacking[0], lacking[1]),
+        without_value=(without_value[0], without_value[1]),
         without_user=int(groups["rows"][~groups["who"]].sum()),
         without_arm=int(groups["rows"][groups["who"] & (groups[schema.ARM] == "")].sum()),
         in_several=len(mixed),
-        named=tuple(sorted(mixed)[:_NAMED]),
+        several_names=tuple(sorted(mixed)[:_NAMED]),
         planned=planned,
         always=always,
-        guardrails=tuple(checked),
+        guardrails=tuple(results),
         groups=tuple(differences),
     )
 

@@ -90,9 +90,9 @@ class ABTest:
     days: float | None
 
     def __str__(self) -> str:
-        over = "" if self.days is None else f" over {_format_days(self.days)} of such traffic"
+        time = "" if self.days is None else f" over {_format_days(self.days)} of such traffic"
         return (
-            f"plan: {self.users:,} users{over}, half of them served by each policy, find a gain of "
+            f"plan: {self.users:,} users{time}, half of them served by each policy, find a gain of "
             f"{self.lift:.3g} per session in 4 of 5 tests\n"
             "stop: at that end by the interval of a planned end of ucfrec compare, or earlier as "
             "soon as its always-valid interval excludes 0"

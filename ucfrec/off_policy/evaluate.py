@@ -91,7 +91,8 @@ class EstimateOptions:
     def __post_init__(self) -> None:
         low, high = self.reward_range or (0.0, 0.0)
         require(low <= high, f"the reward range is {low} to {high}; name the least one first")
-        assert self.measures is not None  # their guardrails can be read
+        for text in self.guardrails:
+            Guardrail.parse(text)
 
 
 DEFAULTS = EstimateOptions()

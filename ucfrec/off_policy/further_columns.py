@@ -29,7 +29,7 @@ def read_measure(
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
-    like: Path,
+    run: Path,
     keep_unknown: bool,
     measure: str,
     store: EpisodeStore,
@@ -40,7 +40,7 @@ def read_measure(
     folder = store.path.with_name(f"measure-{measure.encode().hex():.99}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputNote)
-        prepare(files, mapping, folder, options, like, keep_unknown)
+        prepare(files, mapping, folder, options, run, keep_unknown)
     values = EpisodeStore.open(folder)
     if values.n_steps != store.n_steps:
         raise InputError(

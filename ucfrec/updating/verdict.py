@@ -137,8 +137,8 @@ def _compare(
     low = high = value = float(above.sum() / (below.sum() or 1))
     users = len(np.unique(user[below > 0]))
     if users < FEWEST_USERS:
-        few = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
-        reasons = [few, *reasons]
+        fault = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
+        reasons = [fault, *reasons]
     (interval,) = cluster_intervals(above[:, None], below[:, None], user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high

@@ -122,7 +122,9 @@ class Ope(RuleOptions, LogOptions):
             print("\n".join(reports[names[0]].list_lines(most)))
         else:
             print(f"choice: {choice.headline}")
-            print("\n".join(f"{name}: {report.verdict}" for name, report in reports.items()))
+            print(
+                "\n".join(f"{name}: {report.verdict.headline}" for name, report in reports.items())
+            )
             details.append(_describe_choice(choice))
         if self.details:
             print("\n\n".join(["", *details]))

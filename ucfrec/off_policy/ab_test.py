@@ -1,7 +1,6 @@
 """The difference between two runs that shared the users: an A/B test on joined exposures."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Final
 import pandas as pd
 
 from ucfrec import schema
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import bind, engine, explain_errors, wrong_type
 from ucfrec.logs.join import FEEDBACK
@@ -56,7 +55,7 @@ class Comparison:
     """Rows of a user without an arm."""
     in_several: int
     """Users who were in more than one arm."""
-    named: tuple[str, ...]
+    several_names: tuple[str, ...]
     """Some of them."""
     planned: Evidence
     """Of the second arm less the first, for a test that ends when it was planned to."""
@@ -75,7 +74,7 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
-        names = ", ".join(self.named) + ", …" * (self.in_several > len(self.named))
+        names = ", ".join(self.several_names) + ", …" * (self.in_several > len(self.several_names))
         left_out = {
             f"rows have no {schema.USER_ID}; they are left out": self.without_user,
             f"rows have no {schema.ARM}; they are left out": self.without_arm,
@@ -87,11 +86,6 @@ class Comparison:
             f"{self.always.format('+.4g')} always valid"
         )
         return "\n".join([*lines, *map(str, self.guardrails), *map(str, self.groups)])
-
-    @property
-    def split_p_value(self) -> float:
-        """Of the χ² test that users were drawn into the arms by the intended shares."""
-        return _test_split(self.in_arm, self.shares[0])
 
     @property
     def conclusion(self) -> str:
@@ -109,7 +103,9 @@ class Comparison:
         return f"{says}, but a guardrail is {'broken' if 'broken' in outcomes else 'open'}"
 
 
-def _test_split(users: tuple[int, int], share: float) -> float:
+def find_split_p_value(users: tuple[int, int], share: float) -> float:
+    """The p-value of the χ² test that so many users were drawn into two arms, the first with a
+    probability of `share`."""
     expected = sum(users) * share
     off = (users[0] - expected) ** 2 / (expected * (1 - share))
     return math.erfc(math.sqrt(off / 2))
@@ -144,14 +140,13 @@ class _Means:
     @classmethod
     def of(cls, arms: Sequence[pd.DataFrame]) -> "_Means":
         """Of the users with a value in two arms."""
-        means = [
+        (value_a, error_a), (value_b, error_b) = (
             cluster_mean((arm["value"] / arm["shown"]).to_numpy(), None, arm["shown"].to_numpy())
             for arm in arms
-        ]
-        values, errors = zip(*means, strict=True)
-        sizes = [(len(arm), int(arm["shown"].sum())) for arm in arms]
-        users, rows = zip(*sizes, strict=True)
-        return cls(values, errors, users, rows)
+        )
+        rows_a, rows_b = (int(arm["shown"].sum()) for arm in arms)
+        users = len(arms[0]), len(arms[1])
+        return cls((value_a, value_b), (error_a, error_b), users, (rows_a, rows_b))
 
     def list_faults(self) -> tuple[str, ...]:
         """Why there is no interval."""
@@ -170,8 +165,8 @@ class _Means:
         error = math.sqrt(variance)
         half = NormalDist().inv_cdf(1 - miss / 2) * error
         mixture = expected or EXPECTED * abs(self.values[0]) or error
-        ends = always_valid(value, variance, mixture, miss)
-        return Evidence(value, value - half, value + half), Evidence(value, *ends)
+        low, high = always_valid(value, variance, mixture, miss)
+        return Evidence(value, value - half, value + half), Evidence(value, low, high)
 
     def check(self, guardrail: Guardrail, reasons: Sequence[str]) -> Guardrail:
         """The change of the second arm, as a share of the first."""
@@ -180,8 +175,8 @@ class _Means:
         if faults:
             return replace(guardrail, change=Evidence(None, None, None, faults))
         variance = (error_b / a) ** 2 + (b * error_a / a**2) ** 2
-        ends = always_valid(b / a - 1, variance, EXPECTED)
-        return replace(guardrail, change=Evidence(b / a - 1, *ends))
+        low, high = always_valid(b / a - 1, variance, EXPECTED)
+        return replace(guardrail, change=Evidence(b / a - 1, low, high))
 
 
 def compare_arms(
@@ -208,7 +203,6 @@ def compare_arms(
     files = log_files(paths)
     name = first_and_more(files)
     groups = _sum_by_user(files, column, memory_limit)
-    has_user, has_arm = groups["who"], groups[schema.ARM] != ""
     by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
     if len(names) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
@@ -224,38 +218,25 @@ def compare_arms(
     of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
     share, in_arm = of_first / (of_first + of_second), (len(by_arm[first]), len(by_arm[second]))
     means = _Means.of([valued[arm] for arm in names])
-    lacking = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
-    if any(lacking):
-        text = (
-            f"{name}: {column} has no value in {lacking[0]:,} rows of {first} and {lacking[1]:,} "
-            f"of {second}, which are left out; write 0 where it is meant"
+    without_value = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
+    if any(without_value):
+        warn_user(
+            f"{name}: {column} has no value in {without_value[0]:,} rows of {first} and "
+            f"{without_value[1]:,} of {second}, which are left out; write 0 where it is meant"
         )
-        warnings.warn(text, InputNote, stacklevel=2)
-    reasons = []
-    if (p_value := _test_split(in_arm, share)) < MISMATCH:
-        # A difference may then be one of the users (Fabijan et al., KDD 2019).
-        reasons.append(
-            f"sample ratio mismatch: {in_arm[0]:,} and {in_arm[1]:,} users, "
-            f"{in_arm[0] / sum(in_arm):.1%} and {in_arm[1] / sum(in_arm):.1%}, where {share:.1%} "
-            f"and {1 - share:.1%} were intended (p = {p_value:.2g}): users are missing from an arm,"
-            " or name the shares that were intended: --shares A=0.9,B=0.1"
-        )
+    reasons = _doubt_split(in_arm, share)
     planned, always = means.compare(expected, reasons)
-    checked, parts = [], list[GroupDifference]()
+    results = []
     for guardrail in map(Guardrail.parse, guardrails):
         values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))[1]
-        if min(len(values.get(arm, ())) for arm in names) < 1:
+        if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
-        checked.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
+        results.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
+    differences: list[GroupDifference] = []
     if by is not None:
-        members = dict(list(_sum_by_user(files, column, memory_limit, by).groupby("part")))
-        for part, rows in members.items():
-            values = _split_arms(rows)[1]
-            if min(len(values.get(arm, ())) for arm in names):
-                of_part = _Means.of([values[arm] for arm in names])
-                evidence = of_part.compare(expected, reasons, MISS / len(members))[1]
-                parts.append(GroupDifference(str(part), sum(of_part.users), evidence))
-    mixed = groups[has_user & groups["mixed"]]
+        parts = _sum_by_user(files, column, memory_limit, by)
+        differences = _compare_parts(parts, names, expected, reasons)
+    mixed = groups["name"].dropna().unique()
     return Comparison(
         column=column,
         arms=(first, second),
@@ -264,16 +245,43 @@ def compare_arms(
         in_arm=in_arm,
         shares=(share, 1 - share),
         rows=means.rows,
-        without_value=(lacking[0], lacking[1]),
-        without_user=int(groups["rows"][~has_user].sum()),
-        without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
-        in_several=len(mixed["name"].unique()),
-        named=tuple(sorted(mixed["name"].unique())[:_NAMED]),
+        without_value=(without_value[0], without_value[1]),
+        without_user=int(groups["rows"][~groups["who"]].sum()),
+        without_arm=int(groups["rows"][groups["who"] & (groups[schema.ARM] == "")].sum()),
+        in_several=len(mixed),
+        several_names=tuple(sorted(mixed)[:_NAMED]),
         planned=planned,
         always=always,
-        guardrails=tuple(checked),
-        groups=tuple(parts),
+        guardrails=tuple(results),
+        groups=tuple(differences),
     )
+
+
+def _compare_parts(
+    groups: pd.DataFrame, arms: Sequence[str], expected: float | None, reasons: Sequence[str]
+) -> list[GroupDifference]:
+    """The differences in the parts of the rows, with always-valid intervals that hold at once."""
+    parts, differences = list(groups.groupby("part")), []
+    for part, rows in parts:
+        values = _split_arms(rows)[1]
+        if all(len(values.get(arm, ())) for arm in arms):
+            means = _Means.of([values[arm] for arm in arms])
+            evidence = means.compare(expected, reasons, MISS / len(parts))[1]
+            differences.append(GroupDifference(str(part), sum(means.users), evidence))
+    return differences
+
+
+def _doubt_split(users: tuple[int, int], share: float) -> list[str]:
+    """Why a difference may be one of the users (Fabijan et al., KDD 2019), if it may."""
+    p_value, total = find_split_p_value(users, share), sum(users)
+    if p_value >= MISMATCH:
+        return []
+    return [
+        f"sample ratio mismatch: {users[0]:,} and {users[1]:,} users, {users[0] / total:.1%} and "
+        f"{users[1] / total:.1%}, where {share:.1%} and {1 - share:.1%} were intended (p = "
+        f"{p_value:.2g}): users are missing from an arm, or name the shares that were intended: "
+        "--shares A=0.9,B=0.1"
+    ]
 
 
 def _split_arms(groups: pd.DataFrame) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:

@@ -90,9 +90,9 @@ class ABTest:
     days: float | None
 
     def __str__(self) -> str:
-        over = "" if self.days is None else f" over {_format_days(self.days)} of such traffic"
+        time = "" if self.days is None else f" over {_format_days(self.days)} of such traffic"
         return (
-            f"plan: {self.users:,} users{over}, half of them served by each policy, find a gain of "
+            f"plan: {self.users:,} users{time}, half of them served by each policy, find a gain of "
             f"{self.lift:.3g} per session in 4 of 5 tests\n"
             "stop: at that end by the interval of a planned end of ucfrec compare, or earlier as "
             "soon as its always-valid interval excludes 0"
@@ -121,17 +121,17 @@ def cut_to_steps(steps: LoggedSteps) -> LoggedSteps | None:
     a step (Dudík, Langford & Li, ICML 2011), had the evaluated policy chosen the item after a
     history as the logging policy makes them; not the return of its sessions. None without models,
     or where too few steps can be weighed."""
-    known = ~np.isnan(steps.propensity)
-    if steps.model is None or known.sum() < 2 or not steps.target[known].any():
+    rows = np.flatnonzero(~np.isnan(steps.propensity))
+    if steps.model is None or len(rows) < 2 or not steps.target[rows].any():
         return None
-    value, logged = steps.model.reward[known], steps.model.logged_reward[known]
+    value, logged = steps.model.reward[rows], steps.model.logged_reward[rows]
     return LoggedSteps(
-        np.arange(known.sum()),
-        steps.reward[known],
-        steps.propensity[known],
-        steps.target[known],
+        np.arange(len(rows)),
+        steps.reward[rows],
+        steps.propensity[rows],
+        steps.target[rows],
         Modelled(value, q=logged, v=value, logged_reward=logged),
-        steps.users[steps.session[known]],
+        steps.users[steps.session[rows]],
     )
 
 

@@ -86,7 +86,8 @@ class EstimateOptions:
     def __post_init__(self) -> None:
         low, high = self.reward_range or (0.0, 0.0)
         require(low <= high, f"the reward range is {low} to {high}; name the least one first")
-        assert self.measures is not None  # their guardrails can be read
+        for text in self.guardrails:
+            Guardrail.parse(text)
 
 
 DEFAULTS = EstimateOptions()
@@ -258,30 +259,13 @@ def make_report(
     """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
     mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
     """
-    rows, model = logs.steps, logs.models
+    model = logs.models
     steps, diagnosis, verdict = _conclude_lists(logs, seed, options)
-    single, traffic = cut_to_steps(steps), logs.traffic
-    of_steps: dict[str, Estimate] = {}
-    if not verdict.lift.is_reliable:
-        plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
-        verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
-        if single is not None:
-            per_step = conclude(single, seed, forbidden=logs.forbidden)
-            of_steps = add_reasons(estimate(single, seed), per_step.reasons)
-            verdict = replace(verdict, per_step=per_step)
     weighable = None if steps.lacking.all() else steps.weighable
-    terms = None
-    if weighable is not None and verdict.estimator is not None:
-        terms = session_terms(weighable)[verdict.estimator].influences
-        if logs.groups is not None:
-            lifts = terms - weighable.returns
-            groups = compare_groups(logs.groups, rows, lifts, seed)
-            verdict = replace(verdict, groups=groups)
-    guardrails = [
-        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
-        for text, measure in zip(options.guardrails, options.measures, strict=True)
-    ]
-    verdict = replace(verdict, guardrails=guardrails)
+    verdict, terms = _add_evidence(logs, steps, diagnosis, verdict, seed, options)
+    of_steps: dict[str, Estimate] = {}
+    if verdict.per_step is not None and (single := cut_to_steps(logs.steps)) is not None:
+        of_steps = add_reasons(estimate(single, seed), verdict.per_step.reasons)
     estimates = add_reasons(estimate(steps, seed), verdict.reasons)
     if model is not None and not model.converged:
         diverged = "it diverged: its values exceed the largest possible return"
@@ -306,7 +290,7 @@ def make_report(
         conditions={
             "run": shorten_paths(str(trained.folder)),
             "discount": options.discount,
-            "positions": steps.positions if rows.place is not None else None,
+            "positions": steps.positions if logs.steps.place is not None else None,
             "anonymous": not options.users_known,
             "sessions": len(steps.first),
             "steps": logs.rows,
@@ -374,6 +358,36 @@ def _conclude_lists(
             f"depend on {others}"
         )
     return chosen
+
+
+def _add_evidence(
+    logs: WeighedLogs,
+    steps: LoggedSteps,
+    diagnosis: Diagnosis,
+    verdict: Verdict,
+    seed: int,
+    options: EstimateOptions,
+) -> tuple[Verdict, Float64Array | None]:
+    """The verdict with what else was asked for, and (S,) whose mean is the estimate that it is of;
+    where that is not reliable, what single steps show, and what would let the logs say more."""
+    rows, traffic, terms = logs.steps, logs.traffic, None
+    if verdict.estimator is not None:
+        terms = session_terms(steps.weighable)[verdict.estimator].influences
+        if logs.groups is not None:
+            lifts = terms - steps.weighable.returns
+            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed))
+    guardrails = [
+        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
+        for text, measure in zip(options.guardrails, options.measures, strict=True)
+    ]
+    verdict = replace(verdict, guardrails=guardrails)
+    if verdict.lift.is_reliable:
+        return verdict, terms
+    plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
+    verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
+    if (single := cut_to_steps(rows)) is not None:
+        verdict = replace(verdict, per_step=conclude(single, seed, forbidden=logs.forbidden))
+    return verdict, terms
 
 
 def _make_rows(

@@ -29,7 +29,7 @@ def read_measure(
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
-    like: Path,
+    run: Path,
     keep_unknown: bool,
     measure: str,
     store: EpisodeStore,
@@ -40,7 +40,7 @@ def read_measure(
     folder = store.path.with_name(f"measure-{measure.encode().hex():.99}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputNote)
-        prepare(files, mapping, folder, options, like, keep_unknown)
+        prepare(files, mapping, folder, options, run, keep_unknown)
     values = EpisodeStore.open(folder)
     if values.n_steps != store.n_steps:
         raise InputError(
@@ -72,15 +72,15 @@ def read_groups(
     with engine(inputs, folder, options.memory_limit) as connection:
         for key, tables in _find_tables(connection, files, mapping, options, column):
             with explain_errors(connection, [table for table, _ in tables]):
-                pairs = [_read_values(connection, *table, key, column) for table in tables]
+                pairs = [_read_values(connection, t, id_, key, column) for t, id_ in tables]
             values = pd.concat(pairs).drop_duplicates()
             if values["id"].is_unique:
                 break
         else:
             raise InputError(f"{files[0]}: --by {column}: users and items have several values")
-    known, (listed, place) = values.set_index("id")["value"], ids[key]
-    texts = pd.Series(listed.tolist(), dtype=object).astype(str)
-    names = texts.map(known).reindex(place)
+    id_values, place = ids[key]
+    texts = pd.Series(id_values.tolist(), dtype=object).astype(str)
+    names = texts.map(values.set_index("id")["value"]).reindex(place)
     sizes = names.value_counts()
     if not 0 < len(sizes) <= MOST_GROUPS:
         raise InputError(
@@ -105,8 +105,8 @@ def _find_tables(
             for part in features
             for table in open_tables(connection, log_files(part.files))
         ]
-        if named := [pair for pair in opened if column in pair[0].columns]:
-            yield key, named
+        if tables := [pair for pair in opened if column in pair[0].columns]:
+            yield key, tables
             return
     log = open_log_tables(connection, files, mapping, options.reward or "0", options.session_by)
     for key in (schema.USER_ID, schema.ITEM_ID):
@@ -117,9 +117,9 @@ def _read_values(
     connection: duckdb.DuckDBPyConnection, table: Table, id_: str, key: str, column: str
 ) -> pd.DataFrame:
     """The different pairs of an id and a value of the column, as texts."""
-    named, by = bind(connection, table, key, id_), bind(connection, table, "--by", column)
-    texts = named.columns if named.is_column else ()
-    text = table.text_of(texts[0]) if texts else f"CAST({named.sql} AS VARCHAR)"
-    source = table.with_texts([*named.columns, *by.columns], texts).sql
+    bound, by = bind(connection, table, key, id_), bind(connection, table, "--by", column)
+    texts = bound.columns if bound.is_column else ()
+    text = table.text_of(texts[0]) if texts else f"CAST({bound.sql} AS VARCHAR)"
+    source = table.with_texts([*bound.columns, *by.columns], texts).sql
     pairs = f"SELECT DISTINCT {text} AS id, CAST({by.sql} AS VARCHAR) AS value FROM {source}"
     return connection.execute(f"FROM ({pairs}) WHERE id IS NOT NULL AND value IS NOT NULL").df()

@@ -107,7 +107,7 @@ def compare_groups(
     """The lifts (S,) of sessions with weights by group of users; or, by SNPDIS, by the group of
     items that returns come from. Intervals of groups whose weights stand hold at once."""
     differences, weighable = list[GroupDifference](), steps.weighable
-    terms = dict[int, tuple[Float64Array, Float64Array]]()
+    terms = dict[int, Float64Array]()
     for number, name in enumerate(groups.names):
         if groups.of_items:
             rewards = np.where(groups.number == number, steps.reward, 0.0)
@@ -123,11 +123,9 @@ def compare_groups(
         users = len(np.unique(weighable.users[inside]))
         differences.append(GroupDifference(name, users, unknown))
         if not reasons:
-            terms[number] = above, inside.astype(np.float64)
+            terms[number] = np.stack([above, inside])
     if terms:
-        aboves, belows = (
-            np.stack(columns, axis=1) for columns in zip(*terms.values(), strict=True)
-        )
+        aboves, belows = np.stack([*terms.values()], axis=2)
         ends = simultaneous_intervals(aboves, belows, weighable.user, seed)
         for number, (value, low, high) in zip(terms, ends, strict=True):
             evidence = Evidence(value, low, high)

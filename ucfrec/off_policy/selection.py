@@ -63,7 +63,8 @@ class Selection:
             return "The logs allow no conclusion on any of the candidates"
         first = self.standings[0]
         if len(self.standings) == 1:
-            return f"{first.name} is the only candidate"
+            supported = " that these logs can evaluate" * bool(self.excluded)
+            return f"{first.name} is the only candidate{supported}"
         sure = f"best with probability {first.probability_best:.2f}"
         if self.regret == 0:
             value = f"{self.corrected:.4g} per session, {sure}"

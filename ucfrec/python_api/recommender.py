@@ -388,8 +388,8 @@ class Recommender:
             seed: of the folds and the bootstrap.
         """
         trained = self._load_for(logs)
-        read = read_logs(trained, logs, mapping, True, options.measures, options.by)
-        with read as logged:
+        reading = read_logs(trained, logs, mapping, True, options.measures, options.by)
+        with reading as logged:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,

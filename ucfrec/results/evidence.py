@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
-Standing: TypeAlias = Literal["better", "worse", "level", "open"]
+Relation: TypeAlias = Literal["better", "worse", "level", "open"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Evidence:
         """Whether there is an interval, and no reason against it."""
         return not self.reasons and self.interval is not None
 
-    def standing(self, margin: float = 0.0) -> Standing:
+    def standing(self, margin: float = 0.0) -> Relation:
         """What a difference shows of the first against the second: level if it is at most `margin`,
         open if it is not reliable or may be either."""
         if not self.is_reliable or self.low is None or self.high is None:

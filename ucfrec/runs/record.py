@@ -30,7 +30,7 @@ from ucfrec.files.atomic import read_json
 from ucfrec.files.record import RUN_RECORD, SMALL, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
-from ucfrec.results.evidence import Evidence, Standing
+from ucfrec.results.evidence import Evidence, Relation
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
@@ -127,7 +127,7 @@ class UpdateVerdict(Entry):
         )
 
     @property
-    def result(self) -> Standing:
+    def result(self) -> Relation:
         """Worse if it harms any measure, else what the deciding one shows."""
         return "worse" if self.harms else self.differences[self.decided_by].standing()
 

@@ -59,13 +59,13 @@ def compare_runs(
         propensity = rows.column(schema.PROPENSITY).astype(np.float64)
     weighed = np.flatnonzero(propensity > 0)
     # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
-    shown = np.where(propensity > 0, propensity, np.inf) if len(weighed) else np.ones(len(reward))
-    likes = liked / shown
+    shares = np.where(propensity > 0, propensity, np.inf) if len(weighed) else np.ones(len(reward))
+    likes = liked / shares
     counted, faults = np.flatnonzero(likes), list[str]()
     if len(counted):
-        target = np.full(len(counted), 1 / np.mean(1 / shown[counted]))
+        target = np.full(len(counted), 1 / np.mean(1 / shares[counted]))
         faults = list_reasons(
-            diagnose(_cut_rows(likes[counted], shown[counted], target, user[counted]))
+            diagnose(_cut_rows(likes[counted], shares[counted], target, user[counted]))
         )
     differences = {RANKING: _compare((new_gain - old_gain) * likes, likes, user, seed, faults)}
     if len(weighed):
@@ -136,8 +136,8 @@ def _compare(
     low = high = value = float(above.sum() / (below.sum() or 1))
     users = len(np.unique(user[below > 0]))
     if users < FEWEST_USERS:
-        few = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
-        reasons = [few, *reasons]
+        fault = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
+        reasons = [fault, *reasons]
     (interval,) = cluster_intervals(above[:, None], below[:, None], user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high

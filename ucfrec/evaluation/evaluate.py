@@ -62,7 +62,7 @@ def evaluate_policy(
     """Result row of a trained policy, under that name; InputError if its actions or observations do
     not fit this environment. `seed` is of the draws, and environment i is seeded with `seed` + i;
     without a rule, the run's own decides."""
-    env = environment.simulator().started(min(episodes, SIDE_BY_SIDE), environment.folder)
+    env = environment.simulator().make(min(episodes, SIDE_BY_SIDE), environment.folder)
     numbers, rule = _item_numbers(environment, env, trained), rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
     record = trained.record

@@ -6,20 +6,18 @@ from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias
 
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    ConfigDict,
     Field,
     PlainSerializer,
     PlainValidator,
     TypeAdapter,
 )
 
-from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import Evidence, RuleRecord
+from ucfrec.choosing.choice import RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
@@ -34,7 +32,6 @@ from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 
-_Report = TypeVar("_Report")
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
@@ -92,17 +89,6 @@ class TrainingRecord(Record):
     """Columns of the logged observation that the policy does not see, ascending."""
     extra: dict[Text, Any] = Field(default_factory=dict)
     """Entries of the program that trained it, which `ucfrec` keeps and does not read."""
-
-
-class Candidate(Entry):
-    """A decision rule that was tried, with what was measured of it."""
-
-    model_config = ConfigDict(extra="allow")
-
-    rule: SavedRule
-    value: Number | None = None
-    """Mean return of a session in the user model; None for a rule that was not simulated."""
-    evidence: Evidence | None = None
 
 
 class Difference(Entry):
@@ -301,22 +287,11 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
     return refit if whole else None
 
 
-def read_candidates(run: Path) -> tuple[Candidate, ...]:
-    """The decision rules that the choice of a run tried; none if it did not choose. InputError if
-    they are damaged."""
-    path = run / CANDIDATES
-    return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
-
-
 def read_augmentation(path: Path) -> AugmentationReport:
     """The report of an augmentation that is made, of a run that may still be in training;
     InputError if it is damaged."""
-    return _read_stage(path, AugmentationReport)
-
-
-def _read_stage(path: Path, kind: type[_Report]) -> _Report:
     with damage_explained(path, RunRecord.REMEDY):
-        return TypeAdapter(kind).validate_python(read_json(path))
+        return TypeAdapter(AugmentationReport).validate_python(read_json(path))
 
 
 def place_of(store: Path, run: Path) -> dict[str, str | None]:

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
     from ucfrec.acting.rollout import Actor
 
-COLUMNS = (
-    "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
-)  # fmt: skip
+COLUMNS = ("coverage", "coverage_per_turn", "diversity", "novelty")
 """Metrics of the items that were recommended, where they can be measured."""
 
 

@@ -3,17 +3,15 @@
     python benchmarks/serve_load.py RUN --results benchmarks/results/serve_load.jsonl
 
 Starts the server on a free port of the loopback interface, with further options such as
-`--reward-weight 2`, and asks it with wrk where that is installed, otherwise with httpx: one client
-first, then many; then the same with each further number of workers. Appends a row for each number
-of clients and prints a table. Requests/s are of wall time. Client and server share the cores; the
-CPU time of either, unlike the rate, hardly depends on what else these do.
+`--reward-weight 2`, and asks it with wrk, which has to be installed: one client first, then many;
+then the same with each further number of workers. Appends a row for each number of clients and
+prints a table. Requests/s are of wall time. Client and server share the cores; the CPU time of
+either, unlike the rate, hardly depends on what else these do.
 """
 
-import asyncio
 import json
 import re
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -89,24 +87,6 @@ def with_wrk(address: str, body: bytes, clients: int, seconds: float) -> dict[st
     return {"rate": count / taken, "p50_ms": p50, "p90_ms": p90, "p99_ms": p99}
 
 
-async def with_httpx(address: str, body: bytes, clients: int, seconds: float) -> dict[str, float]:
-    """Milliseconds and requests per second, as clients in this process find them."""
-    taken: list[float] = []
-    until = time.perf_counter() + seconds
-
-    async def ask(http: httpx.AsyncClient) -> None:
-        while time.perf_counter() < until:
-            began = time.perf_counter()
-            answer = await http.post("/recommendations", content=body)
-            taken.append(1e3 * (time.perf_counter() - began))
-            assert answer.status_code == 200, answer.text
-
-    async with httpx.AsyncClient(base_url=address, timeout=60) as http:
-        await asyncio.gather(*(ask(http) for _ in range(clients)))
-    p50, p90, p99 = np.quantile(taken, [0.5, 0.9, 0.99]).tolist()
-    return {"rate": len(taken) / seconds, "p50_ms": p50, "p90_ms": p90, "p99_ms": p99}
-
-
 def cpu_seconds(address: str) -> tuple[float, float]:
     """CPU time of the server, and of what asks it, so far."""
     metrics = httpx.get(f"{address}/metrics").text
@@ -120,10 +100,7 @@ def cpu_seconds(address: str) -> tuple[float, float]:
 def measured(address: str, body: bytes, clients: int, seconds: float) -> dict[str, float]:
     """Rate, latencies, and CPU milliseconds of a request on either side."""
     before = cpu_seconds(address)
-    if shutil.which("wrk"):
-        found = with_wrk(address, body, clients, seconds)
-    else:
-        found = asyncio.run(with_httpx(address, body, clients, seconds))
+    found = with_wrk(address, body, clients, seconds)
     after, count = cpu_seconds(address), found["rate"] * seconds
     for name, then, now in zip(("server", "client"), before, after, strict=True):
         found[f"{name}_cpu_ms"] = 1e3 * (now - then) / count
@@ -140,7 +117,6 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="of a forward pass (default: 1)")
     options, rule = parser.parse_known_args()
     trained = TrainedPolicy.load(options.run)
-    tool = "wrk" if shutil.which("wrk") else "httpx"
     assert trained.item_ids is not None
     lines = list[tuple[object, ...]]()
     body = request(trained, options.history)
@@ -158,7 +134,7 @@ def main() -> None:
                 found = measured(address, body, clients, options.seconds)
                 about["wall_time_s"] = time.perf_counter() - began
                 about["conditions"] = {"clients": clients, "workers": workers, **known}
-                append_row(options.results, SUITE, task, tool, found, **about)
+                append_row(options.results, SUITE, task, "wrk", found, **about)
                 lines.append((workers, clients, *(f"{value:,.4g}" for value in found.values())))
     heads = ("workers", "clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
     print(markdown_table((*heads, "CPU of the server, ms", "of the client, ms"), lines))

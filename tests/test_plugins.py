@@ -8,14 +8,10 @@ import pytest
 from ucfrec.commands.cli import main
 
 MODULE = """
-from ucfrec.evaluation.simulator import Simulator
 NUMBER = 7
-BEHAVIORS = {"random": lambda env, seed: None}
-EMPTY = Simulator("no environment", lambda n, folder: 5, BEHAVIORS, "click")
 """
 ENTRY_POINTS = """[ucfrec.simulators]
 number = my_things:NUMBER
-empty = my_things:EMPTY
 [ucfrec.datasets]
 number = my_things:NUMBER
 gone = my_gone:DATASET
@@ -40,8 +36,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("command", "says"),
     [
         ("collect --env number --sessions 2 --out logs", "the simulator 'number' is installed as"),
-        ("collect --env empty --sessions 2 --out logs", "(no environment) makes an object of type"),
-        ("evaluate --env empty --behavior random", "(no environment) makes an object of type int"),
         ("prepare log.csv --dataset number --out store", "the dataset 'number' is installed as"),
         ("benchmark number", "the benchmark 'number' is installed as my_things:NUMBER"),
         ("datasets open-bandits", "no data set is called"),

@@ -2,15 +2,18 @@
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 _PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium")
+_FOLDERS = re.compile(r"(?:^|(?<==))(?=[/~\\]|\w:[/\\]).*[/\\](?=[^/\\])")
+"""Those of a path that is absolute on POSIX or Windows, or relative to a home folder."""
 
 
 def versions(packages: Sequence[str] = ()) -> dict[str, str]:
@@ -45,17 +48,7 @@ def command_line() -> str:
 
 def shorten_paths(argument: str) -> str:
     """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
-    option, equals, value = "", "", argument
-    if not _is_absolute(argument):
-        option, equals, value = argument.rpartition("=")
-    name = PureWindowsPath(value).name
-    return f"{option}{equals}{name}" if name and _is_absolute(value) else argument
-
-
-def _is_absolute(path: str) -> bool:
-    """Whether `path` is absolute on POSIX or Windows, or relative to a home folder."""
-    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
-    return rooted or path.startswith("~")
+    return _FOLDERS.sub("", argument)
 
 
 def config_hash(config: Mapping[str, Any]) -> str:

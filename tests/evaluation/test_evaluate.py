@@ -1,4 +1,4 @@
-"""Coverage, diversity, novelty and dominance against plain loops, and what must never hold."""
+"""Coverage, diversity and novelty against plain loops, and what must never hold."""
 
 import itertools
 import math
@@ -19,7 +19,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.evaluate import (
     diversity,
-    dominant_tags,
     evaluate_behavior,
     evaluate_policy,
     variety_columns,
@@ -58,17 +57,6 @@ def test_diversity_is_that_of_a_plain_loop(seed: int) -> None:
     assert diversity(episodes, items, incidence) == pytest.approx(np.mean(own))
 
 
-def test_the_dominant_tags_cover_at_most_their_share() -> None:
-    incidence = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], dtype=bool)
-    dominant = dominant_tags(incidence, np.array([50, 20, 20, 10]))
-    # Counts 60, 30, 20 of 110: the first covers 0.55, both 0.82.
-    assert dominant.tolist() == [True, False, False]
-    # One of more than the share is dominant alone.
-    incidence, positives = np.eye(3, dtype=bool), np.array([5, 90, 5])
-    assert dominant_tags(incidence, positives).tolist() == [False, True, False]
-    assert not dominant_tags(incidence, 0 * positives).any()
-
-
 TAGS_OF_ITEMS = [(0,), (0, 1), (2,), (), (1, 2), (3,)]
 
 
@@ -83,34 +71,28 @@ def test_columns_are_those_of_plain_loops() -> None:
 
     episodes, items = np.hstack(seen)
     tags = [set(own) or {-1} for own in TAGS_OF_ITEMS]
-    popular, positive = [0.0] * 6, Counter[int]()
+    popular = [0.0] * 6
     for log, number in enumerate(numbers.tolist()):
         if number >= 0:
             popular[number] = int(shown[log]) / 20
-            positive.update({tag: int(liked[log]) for tag in tags[number]})
     rarest = min(p for p in popular if p)
     own = []
     for episode in set(episodes.tolist()):
         pairs = list(itertools.combinations(items[episodes == episode].tolist(), 2))
         apart = [1 - len(tags[a] & tags[b]) / len(tags[a] | tags[b]) for a, b in pairs]
         own.append(sum(apart) / len(apart) if apart else 1.0)
-    dominant, covered = set(), 0
-    for tag, count in sorted(positive.items(), key=lambda pair: (-pair[1], pair[0])):
-        covered += count
-        dominant |= {tag} if covered <= 0.8 * positive.total() else set()
     expected = [
         len(set(items.tolist())) / 6,
         len(set(items.tolist())) / len(items),
         sum(own) / len(own),
         sum(-math.log(max(popular[i], rarest)) for i in items) / len(items),
-        sum(bool(tags[i] & dominant) for i in items) / len(items),
     ]
     np.testing.assert_allclose([row[name] for name in COLUMNS], expected)
 
 
 def test_what_is_unknown_is_null() -> None:
     catalog = evaluate_behavior(Environment("synthetic-catalog"), "random", 20, 0)
-    assert not {"novelty", "majority_category_dominance"} & catalog.metrics.keys()
+    assert "novelty" not in catalog.metrics
     assert 0 < catalog["diversity"] <= 1
     taobao = evaluate_behavior(Environment("synthetic-taobao"), "random", 5, 0)
     assert not set(COLUMNS) & taobao.metrics.keys()
@@ -134,4 +116,3 @@ def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
     row = evaluate_policy(environment, trained, "popular", 10, 0, best)
     # The one item that it shows is the one shown most.
     assert row["novelty"] == pytest.approx(-math.log(max(shown.values()) / train.n_episodes))
-    assert row["majority_category_dominance"] in (0.0, 1.0)

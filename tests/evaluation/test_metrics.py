@@ -1,4 +1,8 @@
-"""Metrics on frames: RecTools' numbers, scikit-learn's, and what cannot be measured."""
+"""Metrics on frames: RecTools' numbers, scikit-learn's, and what cannot be measured.
+
+The script that had RecTools 0.19.0 make its numbers:
+`git show 9733b2b8:tests/evaluation/fixtures/make_rectools_metrics.py`.
+"""
 
 import json
 from collections.abc import Callable

@@ -1,6 +1,5 @@
 """Parquet files that claim too much, or hold something else than ids; tables to write."""
 
-import gzip
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -15,11 +14,9 @@ import pytest
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import item_table
-from ucfrec.files import parquet
 from ucfrec.files.parquet import (
     read_ids,
     require_plausible_rows,
-    require_plausible_size,
     write_frames,
 )
 from ucfrec.logs.join import join_feedback
@@ -79,53 +76,6 @@ def test_a_small_file_of_very_many_equal_rows_is_refused_at_once(tmp_path: Path)
         read_ids(path, "item_id")
     require_plausible_rows(path, 1_000_000)
     assert [each.name for each in tmp_path.iterdir()] == ["log.parquet"]
-
-
-HEADER = b"user_id,item_id,timestamp,reward\n"
-
-
-def test_a_small_gzip_file_of_equal_rows_is_refused_before_it_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "bomb.csv.gz"
-    row = b"1,2,1700000000000,1\n" * 50_000
-    with gzip.open(path, "wb", compresslevel=9) as file:
-        file.write(HEADER)
-        for _ in range(300):
-            file.write(row)
-    assert path.stat().st_size < 2**20
-    assert main(["prepare", str(path), "--out", str(tmp_path / "store")]) == 2
-    printed = capsys.readouterr().err.splitlines()[-1]  # after lines of progress, if it took long
-    assert "bomb.csv.gz unfolds to more than 268,435,456 bytes from" in printed
-    assert [each.name for each in tmp_path.iterdir()] == ["bomb.csv.gz"]
-
-
-@pytest.mark.parametrize("parts", [1, 3])
-def test_the_limit_is_a_hundred_times_the_size_and_exact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts: int
-) -> None:
-    """A file may have several members, one after the other."""
-    path = tmp_path / "log.csv.gz"
-    path.write_bytes(gzip.compress(b"a" * 40_000) * parts)
-    monkeypatch.setattr(parquet, "_RATIO", 0)
-    monkeypatch.setattr(parquet, "_LARGE", 40_000 * parts)
-    monkeypatch.setattr(parquet, "_DEFLATE", 10**6)
-    require_plausible_size(path)
-    monkeypatch.setattr(parquet, "_LARGE", 40_000 * parts - 1)
-    with pytest.raises(ValueError, match="unfolds to more than"):
-        require_plausible_size(path)
-
-
-def test_a_log_that_compresses_as_logs_do_passes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(parquet, "_LARGE", 0)
-    rows = "\n".join(f"{i % 50},{i % 7},{1_700_000_000_000 + i},{i % 2}" for i in range(20_000))
-    path = tmp_path / "log.csv.gz"
-    path.write_bytes(gzip.compress(HEADER + rows.encode(), 9))
-    require_plausible_size(path)
-    path.write_bytes(path.read_bytes()[:-40])
-    require_plausible_size(path)  # its reader says that it is cut
 
 
 # Tables to write.

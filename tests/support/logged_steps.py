@@ -1,5 +1,6 @@
 """Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL: of sb-obp
-0.5.10 and scope-rl 0.2.1, made by `tests/off_policy/fixtures/make_obp_fixture.py`."""
+0.5.10 and scope-rl 0.2.1, which need packages older than ours; the script that made them:
+`git show 9733b2b8:tests/off_policy/fixtures/make_obp_fixture.py`."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
-"""Evaluate policies in simulated environments: returns of sessions, and coverage, diversity,
-novelty and dominance of the items recommended (EasyRL4Rec, DORL)."""
+"""Evaluate policies in simulated environments: returns of sessions, and coverage, diversity and
+novelty of the items recommended (EasyRL4Rec)."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,7 @@ def evaluate_policy(
     """Result row of a trained policy, under that name; InputError if its actions or observations do
     not fit this environment. `seed` is of the draws, and environment i is seeded with `seed` + i;
     without a rule, the run's own decides."""
-    env = environment.simulator().started(min(episodes, SIDE_BY_SIDE), environment.folder)
+    env = environment.simulator().make(min(episodes, SIDE_BY_SIDE), environment.folder)
     numbers, rule = _item_numbers(environment, env, trained), rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
     record = trained.record
@@ -177,18 +177,6 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
     return float(np.mean(means))
 
 
-def dominant_tags(incidence: BoolArray, positives: IntArray) -> BoolArray:
-    """Dominant tags (n_tags,) of items with tags (n_items, n_tags) and positive interactions in the
-    training log (n_items,): the most frequent ones that together cover at most 80%, and the most
-    frequent one, if it counts at all."""
-    counts = positives @ incidence.astype(np.int64)
-    order = np.argsort(-counts, kind="stable")
-    dominant = np.empty(len(counts), dtype=np.bool_)
-    dominant[order] = np.cumsum(counts[order]) / max(counts.sum(), 1) <= 0.8
-    dominant[order[:1]] = True
-    return dominant & (counts > 0)
-
-
 def variety_columns(
     env: VectorEnv[Any, Any, Any],
     recommended: Recommended,
@@ -197,9 +185,8 @@ def variety_columns(
 ) -> dict[str, float | None]:
     """The `COLUMNS`; a metric whose inputs are missing is None.
 
-    Diversity (tag Jaccard) and dominance need a catalogue with tags; novelty and dominance need
-    `counts` and `numbers`, which built-in policies do not have: the environment's index of each
-    item of the log, −1 for none.
+    Diversity (tag Jaccard) needs a catalogue with tags; novelty needs `counts` and `numbers`, which
+    built-in policies do not have: the environment's index of each item of the log, −1 for none.
     """
     sessions = np.hstack(recommended)
     episodes, items = sessions[:, np.argsort(sessions[0], kind="stable")]
@@ -212,19 +199,13 @@ def variety_columns(
         row["diversity"] = diversity(episodes, items, incidence)
     if counts is None or numbers is None:
         return row
-    impressions, liked = (
-        np.bincount(numbers[numbers >= 0], counted.numpy()[numbers >= 0], n_items)
-        for counted in (counts.shown, counts.liked)
-    )
+    known = numbers >= 0
+    impressions = np.bincount(numbers[known], counts.shown.numpy()[known], n_items)
     if impressions.any():
         # In nats; an item that was never shown counts as the rarest.
         popularity = impressions / counts.episodes
         popularity = np.maximum(popularity, popularity[popularity > 0].min())
         row["novelty"] = float(-np.log(popularity[items]).mean())
-    if incidence is not None and liked.any():
-        dominant = dominant_tags(incidence, liked.astype(np.int64))
-        of_dominant = incidence[items][:, dominant].any(axis=1)
-        row["majority_category_dominance"] = float(of_dominant.mean())
     return row
 
 

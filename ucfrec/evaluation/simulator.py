@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
     from ucfrec.acting.rollout import Actor
 
-COLUMNS = (
-    "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
-)  # fmt: skip
+COLUMNS = ("coverage", "coverage_per_turn", "diversity", "novelty")
 """Metrics of the items that were recommended, where they can be measured."""
 
 
@@ -44,18 +42,6 @@ class Simulator:
     def logging_behavior(self) -> str:
         """The behavior policy of logs unless another is named."""
         return "mixture" if "mixture" in self.behaviors else "random"
-
-    def started(self, sessions: int, folder: Path | None) -> "VectorEnv[Any, Any, Any]":
-        """What `make` makes of parallel sessions; InputError if it is no vector environment."""
-        from gymnasium.vector import VectorEnv
-
-        env = self.make(sessions, folder)
-        if not isinstance(env, VectorEnv):
-            raise InputError(
-                f"the simulator ({self.summary}) makes an object of type {type(env).__name__}; its "
-                "`make` must give a gymnasium.vector.VectorEnv"
-            )
-        return env
 
 
 GYMNASIUM: Final = "gymnasium:"
@@ -112,7 +98,7 @@ class Environment:
         if behavior not in simulator.behaviors:
             names = ", ".join(simulator.behaviors)
             raise InputError(f"{self.name} has no behavior {behavior!r}; it has {names}")
-        env = simulator.started(sessions, self.folder)
+        env = simulator.make(sessions, self.folder)
         return env, simulator.behaviors[behavior](env, seed)
 
     def simulator(self) -> Simulator:

@@ -1,9 +1,6 @@
-"""What untrusted Parquet and gzip files may claim, columns of ids, and writing tables."""
+"""What untrusted Parquet files may claim, columns of ids, and writing tables."""
 
-import gzip
-import zlib
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,13 +16,6 @@ if TYPE_CHECKING:
 
 _FEW_ROWS = 1_000_000
 _ROWS_PER_BYTE = 10
-_LARGE = 2**28
-"""Bytes to which any gzip file may unfold."""
-_RATIO = 100
-"""Bytes to which a byte of a larger one may: logs with an id and a time a row reach 20."""
-_DEFLATE = 1032
-"""Most bytes to which gzip can unfold one."""
-_BLOCK = 2**20
 _REMEDY = "restore it, or make the store or run again"
 _NO_THREAD = "Failed to launch worker thread"
 """How Arrow says that there is no memory for the stack of a thread."""
@@ -45,28 +35,6 @@ def require_plausible_rows(path: Path, rows: int) -> None:
         raise InputError(
             f"{path} claims {rows:,} rows in {size:,} bytes, so nearly all of them must be equal; "
             "remove the repetitions"
-        )
-
-
-def require_plausible_size(path: Path) -> None:
-    """Check that a gzip file does not unfold to fill the disk, by unfolding it without writing.
-
-    Files that are small enough for any content are not read; damage is left for the reader to find.
-
-    Raises:
-        InputError: it unfolds to over 256 MiB, and to over a hundred times its size.
-    """
-    size = path.stat().st_size
-    most, unfolded = max(_LARGE, _RATIO * size), 0
-    if _DEFLATE * size <= most:
-        return
-    with suppress(EOFError, gzip.BadGzipFile, zlib.error), gzip.open(path) as file:
-        while unfolded <= most and (block := file.read(_BLOCK)):
-            unfolded += len(block)
-    if unfolded > most:
-        raise InputError(
-            f"{path} unfolds to more than {most:,} bytes from {size:,}, so nearly all of its rows "
-            "must be equal; remove the repetitions, or unfold it yourself"
         )
 
 

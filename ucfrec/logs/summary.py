@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +15,7 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.record import LONG
 from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
-from ucfrec.logs.engine import bind, text_of_column
+from ucfrec.logs.engine import bind
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.logs.rows import REASONS, SortedRows, mix_bits
 from ucfrec.logs.sessions import (
@@ -379,7 +378,7 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             rows,
             f"{rows.tied / rows.count:.0%} of the rows share their time with another row of "
             "the user, so their order is unknown and is not learned; log finer times, or add the "
-            f"place on a page{_propose_times(rows.log, mapping)}",
+            "place on a page",
         )
     if report.get("items") == 1:
         _note(
@@ -403,22 +402,6 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"sessions of more than {LONG} times that, as bots have: {bots}; leave them out with "
             f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
         )
-
-
-def _propose_times(log: TypedLog, mapping: LogMapping) -> str:
-    """The option that adds the position to the times of a log; empty where it cannot be run."""
-    texts = {text_of_column(log.connection, t, mapping, schema.TIMESTAMP) for t in log.tables}
-    time = min(texts)
-    if len(texts) > 1 or mapping.time_format or "'" in time:
-        return ""
-    for sum_of in ("{} + to_milliseconds({})", "{} + {}", "{}::TIMESTAMPTZ + to_milliseconds({})"):
-        expression = sum_of.format(time, schema.POSITION)
-        with suppress(InputError, duckdb.Error):
-            for table in log.tables:
-                sums = bind(log.connection, table, "", expression)
-                log.one(f"SELECT max({sums.sql}::VARCHAR) FROM {table.of(sums.columns).sql}")
-            return f": --column timestamp='{expression}'"
-    return ""
 
 
 def _note(rows: SortedRows, message: str) -> None:

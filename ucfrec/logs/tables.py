@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
+from ucfrec.files.parquet import require_plausible_rows
 
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
@@ -294,8 +294,6 @@ def _columns(
         raise InputError(
             f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
         )
-    if file.suffix.lower() == ".gz":
-        require_plausible_size(file)
     source = Table((file,), ()).source
     try:
         if is_parquet:

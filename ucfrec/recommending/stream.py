@@ -68,7 +68,11 @@ class _Answers:
         """The answers to lines."""
         waiting: dict[str | int, _Read] = {}
         for number, line in lines:
-            request = self._parse_line(line)
+            request: StreamRequest | InputError
+            try:
+                request = parse(StreamRequest, line, self._responder.limits)
+            except InputError as error:
+                request = error
             user = number if isinstance(request, InputError) else str(request.user_id)
             # Whether rows are remembered is known once they have been answered.
             if user in waiting or len(waiting) == _AT_ONCE:
@@ -76,15 +80,6 @@ class _Answers:
                 waiting = {}
             waiting[user] = number, request
         yield from self._answer_together(waiting.values())
-
-    def _parse_line(self, line: bytes) -> StreamRequest | InputError:
-        if not line.strip():
-            return InputError("the line is blank; send a request on each line")
-        try:
-            request: StreamRequest = parse(StreamRequest, line, self._responder.limits)
-        except InputError as error:
-            return error
-        return request
 
     def _answer_together(self, waiting: Collection[_Read]) -> Iterator[dict[str, Any]]:
         """The answers to requests of different users, with one forward pass."""

@@ -84,15 +84,6 @@ def group_auc(
     return auc * weight, weight
 
 
-def ratio_with_error(above: Float64Array, below: Float64Array) -> tuple[float, float]:
-    """Σ above / Σ below over users (U,), and its standard error by linearisation; NaN for 0 / 0."""
-    total = below.sum()
-    if total == 0:
-        return float("nan"), float("nan")
-    ratio = above.sum() / total
-    return float(ratio), float(np.sqrt(np.square(above - ratio * below).sum()) / total)
-
-
 def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:
     """95% percentile bootstrap interval (low, high) of the mean of `values` (N,)."""
     means = resampled_ratios(values[:, None], np.ones((len(values), 1)), seed)

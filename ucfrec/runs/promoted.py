@@ -24,8 +24,8 @@ class Promoted(Record):
 
     current: Text
     """Name of the run folder, beside the file."""
-    fingerprint: Text = ""
-    """Of the run as it was promoted; empty in a file of an earlier version."""
+    fingerprint: Text
+    """Of the run as it was promoted."""
     previous: tuple[Text, ...] = ()
 
     def run(self, folder: Path) -> Path:
@@ -36,7 +36,7 @@ class Promoted(Record):
 
     def require_same(self, trained: TrainedPolicy) -> None:
         """Check that a run of that name is the one that was promoted, or raise InputError."""
-        if self.fingerprint not in ("", trained.fingerprint):
+        if self.fingerprint != trained.fingerprint:
             raise InputError(
                 f"{trained.folder} is not the run that was promoted: {POINTER} has the fingerprint "
                 f"{self.fingerprint}, the run {trained.fingerprint}; restore that run, or "
@@ -69,7 +69,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
         if pointer is None:
             return _write(run, fingerprint, ())
         again = pointer.current == run.name
-        if not force and not (again and pointer.fingerprint in ("", fingerprint)):
+        if not force and (pointer.current, pointer.fingerprint) != (run.name, fingerprint):
             _require_verdict(run, pointer)
         previous = pointer.previous if again else (*pointer.previous, pointer.current)
         # Written again too, so that a server tries again what it could not use.

@@ -123,7 +123,11 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
     with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
         with damage_explained(plan.out / STUDY, _REMEDY):
             _require_same(study, plan, store)
-            _enqueue_again(study)
+            # What a killed or interrupted process left is run once more, first of all.
+            for trial in study.get_trials(states=(TrialState.RUNNING,)):
+                study.tell(trial.number, state=TrialState.FAIL)
+                if trial.params:
+                    study.enqueue_trial(trial.params)
             left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
         if len(shares) == 1:
@@ -198,14 +202,6 @@ def _require_same(study: Study, plan: Plan, store: EpisodeStore) -> None:
             f"{plan.out} is a search with another {changed}; name another folder, or give the same "
             "options to go on"
         )
-
-
-def _enqueue_again(study: Study) -> None:
-    """Trials that a killed or interrupted process left are run once more, first of all."""
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        study.tell(trial.number, state=TrialState.FAIL)
-        if trial.params:
-            study.enqueue_trial(trial.params)
 
 
 def _run_trials(plan: Plan, count: int, seed: int) -> None:

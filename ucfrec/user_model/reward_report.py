@@ -16,7 +16,6 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.results.statistics import ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
 _BINS = 10
@@ -271,6 +270,8 @@ class UserCalibration:
         observed = (counts * rows.rewards).double().numpy()
         ratio, error = 1.0, 0.0
         if observed.sum() > 0:
-            sums = [np.bincount(episodes, x).astype(np.float64) for x in (expected, observed)]
-            ratio, error = ratio_with_error(sums[0], sums[1])
+            ratio = expected.sum() / observed.sum()
+            # By linearisation, over sessions.
+            residual = np.bincount(episodes, expected - ratio * observed)
+            error = float(np.linalg.norm(residual) / observed.sum())
         return cls(line, (lines[0], lines[1]), ratio - 1, error, weights is not None)

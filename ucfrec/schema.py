@@ -12,6 +12,8 @@ SessionBy: TypeAlias = Literal["session_id", "gap", "user"]
 """How rows form sessions: by a column, by a pause of the user, or one session per user."""
 PROPENSITY: Final = "propensity"
 IS_RANDOM: Final = "is_random"
+CANDIDATES: Final = "candidates"
+"""What was on offer, a list of item_ids or the name of one; in a store, the number of the set."""
 ACTION: Final = "action"
 """A list of floats, in logs whose actions are vectors instead of items."""
 OBSERVATION: Final = "observation"
@@ -47,6 +49,7 @@ STEP_DTYPES: Final = {
     TIMESTAMP: "<i8",
     PROPENSITY: "<f4",
     IS_RANDOM: "|u1",
+    CANDIDATES: "<i4",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 

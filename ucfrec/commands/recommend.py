@@ -114,7 +114,9 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             else:
                 from ucfrec.recommending.exposures import exposures_written
 
-                with exposures_written(self.exposures, trained, rule.hash, frames) as written:
+                with exposures_written(
+                    self.exposures, trained, rule.hash, frames, candidates
+                ) as written:
                     rows = write_frames(self.out, written)
         print(f"{origin(self.out)}: {rows:,} rows")
         if index is not None and index.wanted:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, OFFERS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
@@ -127,13 +127,13 @@ def read_offers(
     connection: duckdb.DuckDBPyConnection,
     names: Sequence[str],
     n_items: int,
-    store: Path | None,
+    older: "Offers | None",
+    sets: IntArray,
 ) -> "Offers | None":
-    """When the items of a store are available, as of feature tables; items that these lack as in
-    the older `store`. None where nobody says."""
+    """When the items of a store are available, as of feature tables; items that these lack as in an
+    `older` one. With sets of candidates (2, C) as of `Offers`. None where nobody says anything."""
     tables = _list_times(connection, names)
-    has_older = store is not None and (store / OFFERS).is_file()
-    if not tables and not has_older:
+    if not tables and older is None and not sets.size:
         return None
     from ucfrec.episodes.offers import Offers  # imports torch
 
@@ -145,10 +145,10 @@ def read_offers(
             f"FROM items JOIN {name} ON {schema.ITEM_ID} = id"
         ).fetchnumpy()
         intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
-    if store is not None and has_older:
-        older = Offers.load(store / OFFERS).intervals
-        intervals = np.hstack([intervals, older[:, ~np.isin(older[0], intervals[0])]])
-    return Offers.of(n_items, intervals)
+    if older is not None:
+        rest = older.intervals
+        intervals = np.hstack([intervals, rest[:, ~np.isin(rest[0], intervals[0])]])
+    return Offers.of(n_items, intervals, sets) if intervals.size or sets.size else None
 
 
 def count_features(

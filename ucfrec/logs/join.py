@@ -7,13 +7,15 @@ from tempfile import gettempdir
 from typing import Final
 
 import duckdb
+import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.parquet import require_table_names, table_writer
+from ucfrec.logs.candidates import list_set_files, select_named_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
-from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files, sets_beside
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -37,7 +39,10 @@ _OTHERS = {
     schema.RUN: "VARCHAR",
     schema.RULE: "VARCHAR",
     schema.ARM: "VARCHAR",
+    schema.CANDIDATES: "VARCHAR",
 }
+_EMPTY = dict.fromkeys((schema.ARM, schema.CANDIDATES), "''")
+"""Columns that exposures may lack, and SQL of what they have instead."""
 """Columns of exposures besides the keys, and their DuckDB types."""
 _EXPOSURE = (*_KEYS, *_OTHERS)
 _MEASURED = (schema.TIMESTAMP, schema.PROPENSITY)
@@ -113,7 +118,8 @@ def join_feedback(
     files = [*shown_files, *feedback_files]
     require_other_files([out], files)
     mapping = mapping or LogMapping()
-    with engine(files, Path(gettempdir()), memory_limit) as connection:
+    set_files = list_set_files(LogMapping(), shown_files)
+    with engine([*files, *set_files], Path(gettempdir()), memory_limit) as connection:
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
         with explain_errors(connection, (*shown_tables, *tables), out.parent):
@@ -129,6 +135,7 @@ def join_feedback(
                 for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )
             connection.execute(f"CREATE TABLE matches AS {' UNION ALL '.join(matches)}")
+            _write_sets(connection, set_files, out)
             _write(connection, columns, further, out)
             ((exposure_rows, written, rows, matched, with_feedback),) = connection.sql(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
@@ -159,7 +166,7 @@ def _holds_feedback(kind: str) -> bool:
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]) -> _Further:
     """Create the table `exposures`, each once, with its `row`; returns its further columns."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in {*_names_of(table), schema.ARM}]
+        missing = [name for name in _EXPOSURE if name not in {*_names_of(table), *_EMPTY}]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
@@ -187,13 +194,12 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
 
 def _select_others(table: Table, keys: Table, further: _Further) -> str:
     """SQL of the columns of exposures besides the `keys` that a table has, and of its rows."""
-    names, values, texts = _names_of(table), {schema.ARM: "''"}, []
+    names, values, texts = _names_of(table), dict(_EMPTY), []
     more = {key: f"more_{n}" for n, key in enumerate(further) if key in names}
     for name, kind in _OTHERS.items():
         if name in names and kind == "VARCHAR":
             texts.append(names[name])
-            absent = "''" if name == schema.ARM else "NULL"
-            values[name] = f"coalesce({table.text_of(names[name])}, {absent})"
+            values[name] = f"coalesce({table.text_of(names[name])}, {_EMPTY.get(name, 'NULL')})"
         elif name in names:
             values[name] = f"CAST({quote_name(names[name])} AS {kind})"
     values |= {alias: quote_name(names[key]) for key, alias in more.items()}
@@ -302,8 +308,20 @@ def _feedback_columns(
 
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
-    absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
+    absent = {name: "" for name in OPTIONAL_COLUMNS if name != schema.SESSION_ID}
     return replace(mapping, columns={**mapping.columns, **absent})
+
+
+def _write_sets(connection: duckdb.DuckDBPyConnection, files: Sequence[Path], out: Path) -> None:
+    """Write the sets of candidates that the exposures name, each once, beside the log; none without
+    any."""
+    sets = connection.sql(
+        f"FROM ({select_named_sets(connection, files)}) "
+        f"SEMI JOIN exposures USING ({schema.CANDIDATES}) ORDER BY {schema.CANDIDATES}"
+    ).to_arrow_table()
+    if sets.num_rows:
+        with atomic_file(sets_beside(out)) as scratch:
+            pq.write_table(sets, scratch)
 
 
 def _write(

@@ -14,14 +14,17 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import pyarrow as pa
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
+from ucfrec.logs.candidates import list_set_files, number_sets
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
     count_features,
@@ -158,20 +161,20 @@ def prepare(
             explain_errors(log.rows.log.connection, log.rows.log.tables, out.parent),
         ):
             typed, report = log.rows.log, log.report
-            offers = log.read_offers(None)
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(log.rows, log.cut, folder, bar, offers=offers)
-            if offers is not None:
-                offers.save(folder / OFFERS)
+                writer = sessions.write_steps(
+                    log.rows, log.cut, folder, bar, offers=log.offers, sets=log.sets
+                )
+            if log.offers is not None:
+                log.offers.save(folder / OFFERS)
             ids = sessions.write_ids(typed, folder)
             for name, tables in log.features.items():
                 if tables:
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]
             record = writer.finish(report["reward"], report, ids)
             if like is not None and typed.key == schema.ITEM_ID:
-                for name in (ITEM_STATES, OFFERS):
-                    if (like / name).is_file():
-                        shutil.copy(like / name, folder / name)
+                if (like / ITEM_STATES).is_file():
+                    shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
             elif typed.key == schema.ITEM_ID:
                 from ucfrec.logs.items import write_item_states  # imports scipy
 
@@ -205,14 +208,11 @@ class PreparedLog:
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
-
-    def read_offers(self, store: Path | None) -> "Offers | None":
-        """When items are available; of those that are in a `store` alone, as it says."""
-        if schema.ITEM_ID not in self.features:
-            return None
-        connection, names = self.rows.log.connection, self.features[schema.ITEM_ID]
-        ((n_items,),) = connection.sql("SELECT count(*) FROM items").fetchall()
-        return read_offers(connection, names, n_items, store)
+    offers: "Offers | None" = None
+    """What was on offer; None for everything. Of a store, too: when items that the log's tables
+    lack are available and, if it grows, its sets of candidates."""
+    sets: IntArray | None = None
+    """Of each code of candidates its set in `offers`; see `number_sets`. None if no row has any."""
 
 
 @contextmanager
@@ -241,7 +241,7 @@ def read_log(
         file for tables in tables_of_ids.values() for t in tables for file in log_files(t.files)
     ]
     id_files = [store / file for _, _, file in sessions.ID_TABLES] if store else []
-    inputs = (*files, *id_files, *feature_files)
+    inputs = (*files, *id_files, *feature_files, *list_set_files(mapping, files))
     with (
         scratch_folder(spill, "sorted") as scratch,
         engine(inputs, spill, options.memory_limit) as connection,
@@ -289,6 +289,7 @@ def read_log(
                 stage.update()
                 for name, names in features.items():
                     require_known_ids(connection, tables_of_ids[name], names, name, not grows)
+                offered = _read_offers(rows, features.get(schema.ITEM_ID, ()), store, grows)
                 report |= {name: getattr(options, name) for name in _REMEMBERED}
                 report |= {
                     **mapping.remember(),
@@ -299,7 +300,27 @@ def read_log(
                     },
                 }
                 stage.update()
-        yield PreparedLog(rows, cut, features, report, scratch)
+        yield PreparedLog(rows, cut, features, report, scratch, *offered)
+
+
+def _read_offers(
+    rows: SortedRows,
+    names: Sequence[str],
+    store: Path | None,
+    grows: bool,
+) -> tuple["Offers | None", IntArray | None]:
+    """`PreparedLog.offers` and `sets`, after `number_ids`; `names` of `load_features` of items."""
+    older, log = None, rows.log
+    if log.key != schema.ITEM_ID:
+        return None, None
+    if store is not None and (store / OFFERS).is_file():
+        from ucfrec.episodes.offers import Offers  # imports torch
+
+        older = Offers.load(store / OFFERS)
+    known = older.sets.numpy() if older is not None and grows else np.zeros((2, 0), dtype=np.int64)
+    numbers, sets = number_sets(rows, known) or (None, known)
+    (n_items,) = log.one("SELECT count(*) FROM items")
+    return read_offers(log.connection, names, n_items, older, sets), numbers
 
 
 def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:

@@ -20,7 +20,7 @@ from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
-from ucfrec.logs.rows import CODES, ITEM, SESSION, USER, SortedRows
+from ucfrec.logs.rows import CANDIDATE_SET, CODES, ITEM, SESSION, USER, SortedRows
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import Progress
@@ -401,13 +401,15 @@ def write_steps(
     first_shard: int = 0,
     fill: Mapping[str, float] = MappingProxyType({}),
     offers: "Offers | None" = None,
+    sets: IntArray | None = None,
 ) -> StoreWriter:
     """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
-    out. Empty for those of the log. Warns of steps whose item is not available, as of `offers`.
+    out. Empty for those of the log. `sets` has the set of candidates of each code, as of
+    `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
     """
-    unavailable = total = 0
+    total, missing = 0, np.zeros(2, dtype=np.int64)
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
     users = _read_numbers(log, "users", schema.USER_ID)
     items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
@@ -415,8 +417,11 @@ def write_steps(
         columns, lengths = episodes.rows, episodes.lengths
         if ITEM in columns:
             columns[schema.ITEM] = items[columns[ITEM]]
+        if sets is not None:
+            columns[schema.CANDIDATES] = sets[columns[CANDIDATE_SET]]
         if offers is not None and lengths.size:
-            unavailable += offers.count_unavailable(columns[schema.ITEM], columns[schema.TIMESTAMP])
+            decided = columns[schema.ITEM], columns[schema.TIMESTAMP]
+            missing += offers.count_missing(*decided, columns.get(schema.CANDIDATES))
             total += len(columns[schema.ITEM])
         if rows.observations is not None:
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
@@ -437,11 +442,14 @@ def write_steps(
             {n: np.repeat(v, lengths) for n, v in values.items()},
         )
         display.update(count)
-    if unavailable:
-        warn_user(
-            f"{log.name}: {unavailable:,} of {total:,} rows show an item at a time at which the "
-            "table of items says it is not available; check the time zones of both"
-        )
+    reasons = (
+        "at a time at which the table of items says it is not available; check the time zones of "
+        "both",
+        f"that is not among their {schema.CANDIDATES}; check that these are what was chosen from",
+    )
+    for number, reason in zip(missing.tolist(), reasons, strict=True):
+        if number:
+            warn_user(f"{log.name}: {number:,} of {total:,} rows show an item {reason}")
     return writer
 
 

@@ -55,7 +55,10 @@ _TYPES = {
     schema.OBSERVATION: "FLOAT[]",
     schema.PROPENSITY: "FLOAT",
     schema.IS_RANDOM: "BOOLEAN",
+    schema.CANDIDATES: "VARCHAR",
 }
+KEY_OF_LIST: Final = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
+"""SQL of the name of a set of candidates that is a list in the log."""
 _DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
 _OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
 
@@ -259,7 +262,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         name: value.columns[0]
         for name, value in bound.items()
         if not table.columnar and value.is_column and value.columns[0] in dict(table.types)
-        if name in _IDS or (name == schema.TIMESTAMP and time_format)
+        if name in (*_IDS, schema.CANDIDATES) or (name == schema.TIMESTAMP and time_format)
     }
     for name, column in raw.items():
         bound[name] = Bound(quote_name(raw_name(column)), "VARCHAR", (), False)
@@ -357,6 +360,11 @@ def cast_value(
             valid = f"{sql} BETWEEN -{MAX_FLOAT} AND {MAX_FLOAT}"
             return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
         remedy = "use a number above 0"
+    elif name == schema.CANDIDATES:
+        if (ids := kind.removesuffix("[]")) in ("VARCHAR", "UUID") or is_integer(ids):
+            key = KEY_OF_LIST if kind != ids else "nullif(CAST({} AS VARCHAR), '')"
+            return key.format(sql), "VARCHAR"
+        remedy = "use a list of item_ids, or integers or text that name a set of candidates"
     else:
         if is_number(kind) or kind == "BOOLEAN":
             return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"

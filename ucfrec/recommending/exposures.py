@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,14 +11,19 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+import xxhash
 
 from ucfrec import schema
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
+from ucfrec.logs.candidates import ITEMS
+from ucfrec.logs.mapping import sets_beside
 from ucfrec.recommending.recommend import RANK
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -45,8 +50,26 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             schema.RUN: pa.string(),
             schema.RULE: pa.string(),
             schema.ARM: pa.string(),
+            schema.CANDIDATES: pa.string(),
         }
     )
+
+
+def name_set(candidates: Array | None) -> str:
+    """16 hexadecimal digits that name a set of ids, in any order; empty for None, everything."""
+    if candidates is None:
+        return ""
+    ids = map(str, np.unique(candidates).tolist())
+    return xxhash.xxh3_64_hexdigest("\n".join(ids).encode())
+
+
+def _write_sets(exposures: Path, sets: Mapping[str, Array], columns: pa.Schema) -> None:
+    """Write sets of candidates, by name, beside a file of exposures; none without any."""
+    if sets:
+        items = pa.list_(columns.field(schema.ITEM_ID).type)
+        lists = pa.array([np.unique(ids).tolist() for ids in sets.values()], items)
+        with atomic_file(sets_beside(exposures)) as scratch:
+            pq.write_table(pa.table({schema.CANDIDATES: [*sets], ITEMS: lists}), scratch)
 
 
 @contextmanager
@@ -55,12 +78,17 @@ def exposures_written(
     trained: TrainedPolicy,
     rule: str,
     frames: Iterable[pd.DataFrame],
+    candidates: Array | None = None,
 ) -> Iterator[Iterator[pd.DataFrame]]:
-    """Yield the same frames of `recommend`, also written to a file, whole once the block ends."""
+    """Yield the same frames of `recommend`, also written to a file, whole once the block ends; the
+    ids that were `candidates` are in a file beside it."""
     columns, now = exposure_schema(trained), int(time.time() * 1000)
     constants: dict[str, str | int] = {
-        schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
+        schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: "",
+        schema.CANDIDATES: name_set(candidates),
     }  # fmt: skip
+    if candidates is not None:
+        _write_sets(path, {name_set(candidates): candidates}, columns)
 
     def write_all() -> Iterator[pd.DataFrame]:
         for frame in frames:
@@ -103,7 +131,8 @@ class ExposureLog:
             raise InputError(f"{folder} cannot be written ({what}); name another folder") from None
         self._folder, self._schema = folder, exposure_schema(trained)
         self._rows, self._seconds, self._clock = rows, seconds, clock
-        self._waiting: list[tuple[str, int, Answer]] = []
+        self._waiting: list[tuple[str, int, str, Answer]] = []
+        self._sets: dict[str, Array] = {}
         self._count, self._lost = 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
@@ -112,11 +141,14 @@ class ExposureLog:
     def add(self, user_id: int | str, answer: "Answer") -> None:
         """Remember an answer that is given now; takes microseconds."""
         now, size = int(self._clock() * 1000), len(answer.items)
+        candidates, name = answer.candidates, name_set(answer.candidates)
         with self._lock:
             if self._count > _MOST_WAITING * self._rows:
                 self._lost += size
                 return
-            self._waiting.append((str(user_id), now, answer))
+            self._waiting.append((str(user_id), now, name, answer._replace(candidates=None)))
+            if candidates is not None:
+                self._sets[name] = candidates
             self._count += size
             full = self._count >= self._rows
         if full:
@@ -145,10 +177,12 @@ class ExposureLog:
     def _flush(self, last: bool) -> None:
         with self._lock:
             waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
+            sets, self._sets = self._sets, {}
         if not count:
             return
         name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
         try:
+            _write_sets(self._folder / name, sets, self._schema)
             with atomic_file(self._folder / name) as scratch:
                 pq.write_table(self._table(waiting), scratch)
         except (OSError, InputError, pa.ArrowException) as error:
@@ -157,19 +191,18 @@ class ExposureLog:
                     self._lost += count
                 else:
                     self._waiting, self._count = waiting + self._waiting, self._count + count
+                    self._sets = sets | self._sets
                 what = f"{error}; {self._count:,} rows wait, {self._lost:,} are lost"
             message = f"ucfrec: exposures: {self._folder / name} cannot be written: {what}"
             print(message, file=sys.stderr, flush=True)
             # A full log would otherwise try again at every answer.
             time.sleep(min(1.0, self._seconds))
 
-    def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
+    def _table(self, waiting: "list[tuple[str, int, str, Answer]]") -> pa.Table:
         rows = [
-            (user, item, now, answer.request_id, position, chance, *answer[4:])  # run, rule, arm
-            for user, now, answer in waiting
-            for position, (item, chance) in enumerate(
-                zip(answer.items, answer.propensities, strict=True), 1
-            )
+            (user, item, now, a.request_id, position, chance, a.run, a.rule, a.arm, candidates)
+            for user, now, candidates, a in waiting
+            for position, (item, chance) in enumerate(zip(a.items, a.propensities, strict=True), 1)
         ]
         frame = pd.DataFrame(rows, columns=self._schema.names)
         return pa.Table.from_pandas(frame, self._schema, preserve_index=False)

@@ -15,7 +15,7 @@ import numpy as np
 import xxhash
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.recommending.exposures import exposure_schema
@@ -49,6 +49,8 @@ class Answer(NamedTuple):
     """Hash of the decision rule."""
     arm: str = ""
     """Run of the user's arm, where runs share the users."""
+    candidates: Array | None = None
+    """Ids that it was chosen from, in any order; None for all items."""
 
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
@@ -223,7 +225,10 @@ class Responder:
         )
         for question, count, *lists in zip(questions, counts, *columns, strict=True):
             items, logs, chances = (values[: min(count, question.k)] for values in lists)
-            yield Answer(items, logs, chances, question.request_id, *self._source)
+            answer = Answer(items, logs, chances, question.request_id, *self._source)
+            if question.candidates is not None:
+                answer = answer._replace(candidates=self.trained.items.ids[question.candidates])
+            yield answer
 
 
 class _Arm(NamedTuple):

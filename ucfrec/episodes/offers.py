@@ -52,16 +52,12 @@ class Offers:
         as of `Offer`."""
         return Offer(self, times, sets)
 
-    def count_missing(
-        self, items: IntArray, times: IntArray, sets: IntArray | None = None
-    ) -> IntArray:
-        """(2,) how many of the items (N,) were not available at times (N,) ms, and how many others
-        not in `sets` (N,), as of `Offer`; −1 is no item."""
-        is_item = items >= 0
-        columns = (values for values in (items, times, sets) if values is not None)
-        item, *decisions = (torch.from_numpy(v[is_item].astype(np.int64)) for v in columns)
-        available, offered = self.at(decisions[0]).has(item), self.at(*decisions).has(item)
-        return np.array([(~available).sum(), (available & ~offered).sum()])
+    def count_unavailable(self, items: IntArray, times: IntArray, sets: IntArray) -> int:
+        """How many of the items (N,) were not on offer at times (N,) ms or in the sets (N,), −1 for
+        all items; −1 is no item."""
+        columns = np.stack([items, times, sets])[:, items >= 0]
+        item, time, numbers = torch.from_numpy(columns.astype(np.int64))
+        return int((~self.at(time, numbers).has(item)).sum())
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""
@@ -116,7 +112,7 @@ class Offer:
         for place in range(int((last - first).max()) if len(items) else 0):
             at = (first + place).clamp(max=len(item) - 1)
             offered |= (first + place < last) & (begin[at] <= times) & (times < end[at])
-        if self.sets is not None:
+        if self.sets is not None and len(offers.pairs):
             pairs = self.sets * len(offers.begin) + items
             offered &= (self.sets < 0) | (columns_of(pairs, offers.pairs) >= 0)
         return offered

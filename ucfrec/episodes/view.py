@@ -359,9 +359,11 @@ class EpisodeView:
         offers = self._columns.offers
         if offers is None:
             return None
-        names = [n for n in (schema.TIMESTAMP, schema.CANDIDATES) if n in self.record.columns]
-        values = (self.step_values(name, episodes, steps).astype(np.int64) for name in names)
-        return offers.at(*map(torch.from_numpy, values))
+        times, sets = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64), None
+        if schema.CANDIDATES in self.record.columns:
+            numbers = self.step_values(schema.CANDIDATES, episodes, steps)
+            sets = torch.from_numpy(numbers.astype(np.int64))
+        return offers.at(torch.from_numpy(times), sets)
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""

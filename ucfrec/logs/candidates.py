@@ -7,13 +7,14 @@ from typing import Final
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import bind, text_of_column, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
-from ucfrec.logs.rows import CANDIDATE_SET, SortedRows
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import KEY_OF_LIST, TypedLog
 
@@ -34,33 +35,26 @@ def list_set_files(mapping: LogMapping, files: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys([*stated, *(file for file in beside if file.is_file())]))
 
 
-def number_sets(rows: SortedRows, older: IntArray) -> tuple[IntArray, IntArray] | None:
+def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | None:
     """Number the sets of candidates of a log, after `number_ids`; None if no row has one.
 
     Sets of the same known items are one. Those of `older`, as of `Offers.sets`, keep their numbers;
     others follow, ordered by their items.
 
-    Returns (K + 1,) the set of each code of `CANDIDATE_SET`, −1 for none and for a set without a
+    Returns (K + 1,) the set of each code of candidates, −1 for none and for a set without a
     known item; and (2, C) all sets, as of `Offers.sets`. Raises InputError if a table of sets
     cannot be used, or a row names a set that is in none.
     """
-    log, connection = rows.log, rows.log.connection
+    connection = log.connection
     if schema.CANDIDATES not in log.columns:
         return None
-    used = np.zeros(log.one("SELECT count(*) FROM candidate_codes")[0] + 1, dtype=bool)
-    for batch in rows.file.read(CANDIDATE_SET):
-        used[batch[CANDIDATE_SET]] = True
-    if not used[:-1].any():
+    (n_codes,) = log.one("SELECT count(*) FROM candidate_codes")
+    if not n_codes:
         return None
-    codes = pa.record_batch([to_arrow(np.flatnonzero(used[:-1]))], ["code"])
-    connection.register("used_codes", codes)
     connection.register("older_sets", pa.record_batch([*map(to_arrow, older)], ["set", "item"]))
-    connection.execute(
-        f"CREATE TABLE named_sets AS {_select_sets(log)}; CREATE TABLE used_sets AS "
-        f"SELECT code, {schema.CANDIDATES} FROM candidate_codes JOIN used_codes USING (code)"
-    )
+    connection.execute(f"CREATE TABLE named_sets AS {_select_sets(log)}")
     unnamed, example = log.one(
-        f"SELECT count(*), min({schema.CANDIDATES}) FROM used_sets "
+        f"SELECT count(*), min({schema.CANDIDATES}) FROM candidate_codes "
         f"ANTI JOIN named_sets USING ({schema.CANDIDATES})"
     )
     if unnamed:
@@ -74,7 +68,7 @@ def number_sets(rows: SortedRows, older: IntArray) -> tuple[IntArray, IntArray] 
         CREATE TABLE numbered_sets AS
         WITH ids AS (
             SELECT code, unnest({ITEMS}) AS id
-            FROM used_sets JOIN named_sets USING ({schema.CANDIDATES})
+            FROM candidate_codes JOIN named_sets USING ({schema.CANDIDATES})
         ),
         new AS (
             SELECT code, list_sort(list(DISTINCT CAST(number AS BIGINT))) AS members
@@ -88,7 +82,7 @@ def number_sets(rows: SortedRows, older: IntArray) -> tuple[IntArray, IntArray] 
             (PARTITION BY number IS NULL ORDER BY members)) AS number
         FROM new LEFT JOIN old USING (members)
     """)
-    numbers = np.full(len(used), -1)
+    numbers = np.full(n_codes + 1, -1)
     numbered = connection.sql("SELECT code, number FROM numbered_sets").fetchnumpy()
     numbers[numbered["code"]] = numbered["number"]
     added = connection.sql(
@@ -100,30 +94,31 @@ def number_sets(rows: SortedRows, older: IntArray) -> tuple[IntArray, IntArray] 
 
 def _select_sets(log: TypedLog) -> str:
     """SQL of the sets that a log holds in lists or names: `candidates` as in its rows, `items`."""
-    connection, sources = log.connection, []
+    connection, lists = log.connection, []
     for table in log.tables:
         text = text_of_column(connection, table, log.mapping, schema.CANDIDATES)
-        lists = bind(connection, table, f"for {schema.CANDIDATES}", text)
-        if lists.kind.endswith("[]"):
-            sources.append(_SETS.format(KEY_OF_LIST.format(lists.sql), lists.sql, table.sql))
+        value = bind(connection, table, f"for {schema.CANDIDATES}", text)
+        if value.kind.endswith("[]"):
+            lists.append(_SETS.format(KEY_OF_LIST.format(value.sql), value.sql, table.sql))
     files = [file for table in log.tables for file in table.files]
-    return select_named_sets(connection, list_set_files(log.mapping, files), sources)
+    return select_named_sets(connection, list_set_files(log.mapping, files), lists)
 
 
 def select_named_sets(
-    connection: duckdb.DuckDBPyConnection, files: Sequence[Path], sources: Sequence[str] = ()
+    connection: duckdb.DuckDBPyConnection, files: Sequence[Path], lists: Sequence[str] = ()
 ) -> str:
-    """SQL of the sets in tables of sets, each once, and in `sources`: `candidates`, the name as
-    text, and `items`, a list of text. Raises InputError if a table lacks these columns."""
-    every = [*sources, _SETS.format("CAST(NULL AS VARCHAR)", "CAST([] AS VARCHAR[])", "range(0)")]
+    """SQL of the sets in tables of sets and in `lists`, each once: `candidates`, the name as text,
+    and `items`, a list of text. Raises InputError if a table lacks these columns."""
+    every = [*lists, _SETS.format("CAST(NULL AS VARCHAR)", "CAST([] AS VARCHAR[])", "range(0)")]
     for table in open_tables(connection, files) if files else ():
         name, ids = (bind(connection, table, "of sets", n) for n in (schema.CANDIDATES, ITEMS))
-        if not ids.kind.endswith("[]"):
-            raise InputError(
-                f"{table.files[0]}: {ITEMS} of a table of sets is {ids.kind}; write a list of ids"
-            )
         every.append(_SETS.format(f"CAST({name.sql} AS VARCHAR)", ids.sql, table.sql))
-    return (
-        f"SELECT {schema.CANDIDATES}, any_value({ITEMS}) AS {ITEMS} "
-        f"FROM ({' UNION ALL '.join(every)}) GROUP BY {schema.CANDIDATES}"
-    )
+    rows = " UNION ALL ".join(every)
+    return f"SELECT {schema.CANDIDATES}, any_value({ITEMS}) AS {ITEMS} FROM ({rows}) GROUP BY ALL"
+
+
+def write_sets(log: Path, sets: pa.Table) -> None:
+    """Write the sets of candidates that a file names beside it; none without any."""
+    if sets.num_rows:
+        with atomic_file(sets_beside(log)) as scratch:
+            pq.write_table(sets, scratch)

@@ -12,8 +12,9 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, OFFERS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
+from ucfrec.logs.candidates import number_sets
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
 from ucfrec.logs.sessions import ID_TABLES
@@ -31,7 +32,7 @@ from ucfrec.logs.tables import (
     quote_name,
     raw_name,
 )
-from ucfrec.logs.typed import cast_value
+from ucfrec.logs.typed import TypedLog, cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -124,20 +125,24 @@ def _list_times(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> 
 
 
 def read_offers(
-    connection: duckdb.DuckDBPyConnection,
+    log: TypedLog,
     names: Sequence[str],
-    n_items: int,
-    older: "Offers | None",
-    sets: IntArray,
-) -> "Offers | None":
-    """When the items of a store are available, as of feature tables; items that these lack as in an
-    `older` one. With sets of candidates (2, C) as of `Offers`. None where nobody says anything."""
-    tables = _list_times(connection, names)
-    if not tables and older is None and not sets.size:
-        return None
+    store: Path | None,
+    grows: bool,
+) -> tuple["Offers | None", IntArray | None]:
+    """What was on offer in the steps of a log, after `number_ids`; None for everything.
+
+    Items are available as the feature tables `names` say, and items that these lack as in a
+    `store`; if it `grows`, sets of candidates follow its own. The second value is the first of
+    `number_sets`, if the log has candidates.
+    """
+    connection, tables = log.connection, _list_times(log.connection, names)
+    has_older = store is not None and (store / OFFERS).is_file()
+    if not (tables or has_older or schema.CANDIDATES in log.columns):
+        return None, None
     from ucfrec.episodes.offers import Offers  # imports torch
 
-    intervals = np.zeros((3, 0), dtype=np.int64)
+    intervals, sets = (np.zeros((rows, 0), dtype=np.int64) for rows in (3, 2))
     begin, until = (f"coalesce({name}, {n})" for name, n in zip(_TIMES, ALWAYS, strict=True))
     for name in tables:
         rows = connection.sql(
@@ -145,10 +150,14 @@ def read_offers(
             f"FROM items JOIN {name} ON {schema.ITEM_ID} = id"
         ).fetchnumpy()
         intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
-    if older is not None:
-        rest = older.intervals
+    if store is not None and has_older:
+        older = Offers.load(store / OFFERS)
+        rest, sets = older.intervals, older.sets.numpy() if grows else sets
         intervals = np.hstack([intervals, rest[:, ~np.isin(rest[0], intervals[0])]])
-    return Offers.of(n_items, intervals, sets) if intervals.size or sets.size else None
+    numbers, sets = number_sets(log, sets) or (None, sets)
+    (n_items,) = log.one("SELECT count(*) FROM items")
+    some = intervals.size or sets.size
+    return Offers.of(n_items, intervals, sets) if some else None, numbers
 
 
 def count_features(

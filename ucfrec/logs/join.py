@@ -7,15 +7,14 @@ from tempfile import gettempdir
 from typing import Final
 
 import duckdb
-import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.parquet import require_table_names, table_writer
-from ucfrec.logs.candidates import list_set_files, select_named_sets
+from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
-from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files, sets_beside
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -135,7 +134,11 @@ def join_feedback(
                 for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )
             connection.execute(f"CREATE TABLE matches AS {' UNION ALL '.join(matches)}")
-            _write_sets(connection, set_files, out)
+            sets = connection.sql(
+                f"FROM ({select_named_sets(connection, set_files)}) "
+                f"SEMI JOIN exposures USING ({schema.CANDIDATES}) ORDER BY {schema.CANDIDATES}"
+            )
+            write_sets(out, sets.to_arrow_table())
             _write(connection, columns, further, out)
             ((exposure_rows, written, rows, matched, with_feedback),) = connection.sql(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
@@ -310,18 +313,6 @@ def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
     absent = {name: "" for name in OPTIONAL_COLUMNS if name != schema.SESSION_ID}
     return replace(mapping, columns={**mapping.columns, **absent})
-
-
-def _write_sets(connection: duckdb.DuckDBPyConnection, files: Sequence[Path], out: Path) -> None:
-    """Write the sets of candidates that the exposures name, each once, beside the log; none without
-    any."""
-    sets = connection.sql(
-        f"FROM ({select_named_sets(connection, files)}) "
-        f"SEMI JOIN exposures USING ({schema.CANDIDATES}) ORDER BY {schema.CANDIDATES}"
-    ).to_arrow_table()
-    if sets.num_rows:
-        with atomic_file(sets_beside(out)) as scratch:
-            pq.write_table(sets, scratch)
 
 
 def _write(

@@ -14,7 +14,6 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import pyarrow as pa
 from pydantic import Field, InstanceOf
 
@@ -24,7 +23,7 @@ from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
-from ucfrec.logs.candidates import list_set_files, number_sets
+from ucfrec.logs.candidates import list_set_files
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
     count_features,
@@ -208,11 +207,9 @@ class PreparedLog:
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
-    offers: "Offers | None" = None
-    """What was on offer; None for everything. Of a store, too: when items that the log's tables
-    lack are available and, if it grows, its sets of candidates."""
-    sets: IntArray | None = None
-    """Of each code of candidates its set in `offers`; see `number_sets`. None if no row has any."""
+    offers: "Offers | None"
+    sets: IntArray | None
+    """As of `read_offers`."""
 
 
 @contextmanager
@@ -287,9 +284,11 @@ def read_log(
                 report = {"reward": reward, **summary.build_report(rows, cut, counts)}
                 summary.note_oddities(rows, report, mapping)
                 stage.update()
+                offers, sets = None, None
+                if log.key == schema.ITEM_ID:
+                    offers, sets = read_offers(log, features.get(log.key, ()), store, grows)
                 for name, names in features.items():
                     require_known_ids(connection, tables_of_ids[name], names, name, not grows)
-                offered = _read_offers(rows, features.get(schema.ITEM_ID, ()), store, grows)
                 report |= {name: getattr(options, name) for name in _REMEMBERED}
                 report |= {
                     **mapping.remember(),
@@ -300,27 +299,7 @@ def read_log(
                     },
                 }
                 stage.update()
-        yield PreparedLog(rows, cut, features, report, scratch, *offered)
-
-
-def _read_offers(
-    rows: SortedRows,
-    names: Sequence[str],
-    store: Path | None,
-    grows: bool,
-) -> tuple["Offers | None", IntArray | None]:
-    """`PreparedLog.offers` and `sets`, after `number_ids`; `names` of `load_features` of items."""
-    older, log = None, rows.log
-    if log.key != schema.ITEM_ID:
-        return None, None
-    if store is not None and (store / OFFERS).is_file():
-        from ucfrec.episodes.offers import Offers  # imports torch
-
-        older = Offers.load(store / OFFERS)
-    known = older.sets.numpy() if older is not None and grows else np.zeros((2, 0), dtype=np.int64)
-    numbers, sets = number_sets(rows, known) or (None, known)
-    (n_items,) = log.one("SELECT count(*) FROM items")
-    return read_offers(log.connection, names, n_items, older, sets), numbers
+        yield PreparedLog(rows, cut, features, report, scratch, offers, sets)
 
 
 def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:

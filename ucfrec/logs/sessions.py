@@ -409,25 +409,27 @@ def write_steps(
     out. Empty for those of the log. `sets` has the set of candidates of each code, as of
     `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
     """
-    total, missing = 0, np.zeros(2, dtype=np.int64)
+    unavailable = total = 0
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
     users = _read_numbers(log, "users", schema.USER_ID)
     items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
     for episodes in read_episodes(rows, cut):
         columns, lengths = episodes.rows, episodes.lengths
+        count = int(lengths.sum())
         if ITEM in columns:
             columns[schema.ITEM] = items[columns[ITEM]]
         if sets is not None:
             columns[schema.CANDIDATES] = sets[columns[CANDIDATE_SET]]
-        if offers is not None and lengths.size:
-            decided = columns[schema.ITEM], columns[schema.TIMESTAMP]
-            missing += offers.count_missing(*decided, columns.get(schema.CANDIDATES))
-            total += len(columns[schema.ITEM])
+        if offers is not None and count:
+            chosen = columns.get(schema.CANDIDATES, np.full(count, -1))
+            unavailable += offers.count_unavailable(
+                columns[schema.ITEM], columns[schema.TIMESTAMP], chosen
+            )
+            total += count
         if rows.observations is not None:
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
         names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
         steps = {name: columns[name] for name in names}
-        count = int(lengths.sum())
         steps |= {n: np.full(count, value) for n, value in fill.items() if n not in steps}
         first = np.zeros(count, dtype=bool)
         first[np.cumsum(lengths) - lengths] = True
@@ -442,14 +444,12 @@ def write_steps(
             {n: np.repeat(v, lengths) for n, v in values.items()},
         )
         display.update(count)
-    reasons = (
-        "at a time at which the table of items says it is not available; check the time zones of "
-        "both",
-        f"that is not among their {schema.CANDIDATES}; check that these are what was chosen from",
-    )
-    for number, reason in zip(missing.tolist(), reasons, strict=True):
-        if number:
-            warn_user(f"{log.name}: {number:,} of {total:,} rows show an item {reason}")
+    if unavailable:
+        warn_user(
+            f"{log.name}: {unavailable:,} of {total:,} rows show an item at a time at which the "
+            "table of items says it is not available (check the time zones of both), or one that "
+            "is not among the row's candidates"
+        )
     return writer
 
 

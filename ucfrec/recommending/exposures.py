@@ -22,8 +22,7 @@ from ucfrec.arrays import Array
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
-from ucfrec.logs.candidates import ITEMS
-from ucfrec.logs.mapping import sets_beside
+from ucfrec.logs.candidates import ITEMS, write_sets
 from ucfrec.recommending.recommend import RANK
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -63,13 +62,10 @@ def name_set(candidates: Array | None) -> str:
     return xxhash.xxh3_64_hexdigest("\n".join(ids).encode())
 
 
-def _write_sets(exposures: Path, sets: Mapping[str, Array], columns: pa.Schema) -> None:
-    """Write sets of candidates, by name, beside a file of exposures; none without any."""
-    if sets:
-        items = pa.list_(columns.field(schema.ITEM_ID).type)
-        lists = pa.array([np.unique(ids).tolist() for ids in sets.values()], items)
-        with atomic_file(sets_beside(exposures)) as scratch:
-            pq.write_table(pa.table({schema.CANDIDATES: [*sets], ITEMS: lists}), scratch)
+def _tabulate_sets(sets: Mapping[str, Array | None]) -> pa.Table:
+    """Sets of candidates by their names, but for None, everything."""
+    lists = {n: np.unique(ids).astype(str).tolist() for n, ids in sets.items() if ids is not None}
+    return pa.table({schema.CANDIDATES: [*lists], ITEMS: [*lists.values()]})
 
 
 @contextmanager
@@ -87,8 +83,7 @@ def exposures_written(
         schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: "",
         schema.CANDIDATES: name_set(candidates),
     }  # fmt: skip
-    if candidates is not None:
-        _write_sets(path, {name_set(candidates): candidates}, columns)
+    write_sets(path, _tabulate_sets({name_set(candidates): candidates}))
 
     def write_all() -> Iterator[pd.DataFrame]:
         for frame in frames:
@@ -132,7 +127,7 @@ class ExposureLog:
         self._folder, self._schema = folder, exposure_schema(trained)
         self._rows, self._seconds, self._clock = rows, seconds, clock
         self._waiting: list[tuple[str, int, str, Answer]] = []
-        self._sets: dict[str, Array] = {}
+        self._sets: dict[str, Array | None] = {}
         self._count, self._lost = 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
@@ -141,14 +136,13 @@ class ExposureLog:
     def add(self, user_id: int | str, answer: "Answer") -> None:
         """Remember an answer that is given now; takes microseconds."""
         now, size = int(self._clock() * 1000), len(answer.items)
-        candidates, name = answer.candidates, name_set(answer.candidates)
+        candidates = name_set(answer.candidates)
         with self._lock:
             if self._count > _MOST_WAITING * self._rows:
                 self._lost += size
                 return
-            self._waiting.append((str(user_id), now, name, answer._replace(candidates=None)))
-            if candidates is not None:
-                self._sets[name] = candidates
+            self._waiting.append((str(user_id), now, candidates, answer._replace(candidates=None)))
+            self._sets[candidates] = answer.candidates
             self._count += size
             full = self._count >= self._rows
         if full:
@@ -182,7 +176,7 @@ class ExposureLog:
             return
         name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
         try:
-            _write_sets(self._folder / name, sets, self._schema)
+            write_sets(self._folder / name, _tabulate_sets(sets))
             with atomic_file(self._folder / name) as scratch:
                 pq.write_table(self._table(waiting), scratch)
         except (OSError, InputError, pa.ArrowException) as error:

@@ -143,7 +143,7 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     assert "evaluate with --filter-seen" in str(verdict)
     filtered = str(conclude(steps, seed=0, diagnosis=diagnosis, filter_seen=True))
     assert "evaluate with --filter-seen" not in filtered
-    assert "items that requests excluded by candidates" in filtered
+    assert "requests excluded by candidates" in filtered
 
 
 def test_weights_are_tested_by_segment() -> None:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.support.killed import kills
-from tests.support.served import histories, requests_of, responder, with_rule
+from tests.support.served import histories, requests_of, responder, tagged_log, with_rule
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
@@ -110,16 +110,19 @@ def test_weights_of_a_policys_own_log_are_1_given_the_candidates(
 ) -> None:
     rule, shown = with_rule(trained, temperature=1.0), tmp_path / "shown"
     file, joined = tmp_path / "rows.parquet", tmp_path / "log.parquet"
-    log, ids = histories(users=30), trained.items.ids.tolist()
+    log, ids = tagged_log(), trained.items.ids.tolist()
+    log = log[log.user_id < 130]
     log.to_parquet(file)
     if served:
         sets = [[*ids[::2], ids[0]], ids[:12], ids[::2][::-1], None]
         requests = [
             Request.model_validate(request | {"candidates": sets[n % 4]})
-            for n, request in enumerate(requests_of(log, new_session=True))
+            for n, request in enumerate(requests_of(log))
         ]
         found = responder(trained, k=1, rule=rule).answers(requests)
-        with closing(ExposureLog(shown, trained)) as exposures:
+        # A minute after the last row, so that sessions go on.
+        clock = iter(log.groupby("user_id").timestamp.max() / 1000 + 60).__next__
+        with closing(ExposureLog(shown, trained, clock=clock)) as exposures:
             for request, answer in zip(requests, found, strict=True):
                 assert isinstance(answer, Answer)
                 exposures.add(request.user_id, answer)

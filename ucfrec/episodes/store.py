@@ -329,10 +329,13 @@ class UserRows:
         return cls(later, earlier, source, first, place)
 
     def values(self, name: str, source: IntArray) -> Array:
-        """Values of a step column at sources of any shape; see `source`."""
+        """Values of a step column at sources of any shape; see `source`. Of candidates, whose sets
+        have other numbers in an earlier store, its rows have none."""
         later, earlier = self.later, self.earlier
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
-        if earlier is not None and (source < 0).any():
+        if name == schema.CANDIDATES:
+            values[source < 0] = -1
+        elif earlier is not None and (source < 0).any():
             steps = earlier.locate(-1 - source[source < 0])
             values[source < 0] = earlier.step_values(name, *steps)
         return values

@@ -260,8 +260,8 @@ _SEEN_REMOVED = (
     "such as seen items, which serve excludes without --keep-seen: evaluate with --filter-seen"
 )
 OTHERS_REMOVED: Final = (
-    "such as items that requests excluded by candidates, or that another system removed: with "
-    "--filter-seen, seen items are left out already"
+    "such as items that another system removed, or that requests excluded by candidates which the "
+    "logs lack: with --filter-seen, seen items are left out already"
 )
 """Why logs may lack choices of a policy that is evaluated without seen items."""
 _DETECTED = 1.96 + 0.84

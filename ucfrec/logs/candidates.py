@@ -51,7 +51,7 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     (n_codes,) = log.one("SELECT count(*) FROM candidate_codes")
     if not n_codes:
         return None
-    connection.register("older_sets", pa.record_batch([*map(to_arrow, older)], ["set", "item"]))
+    connection.register("older_sets", pa.record_batch([*map(to_arrow, older)], ["number", "item"]))
     connection.execute(f"CREATE TABLE named_sets AS {_select_sets(log)}")
     unnamed, example = log.one(
         f"SELECT count(*), min({schema.CANDIDATES}) FROM candidate_codes "
@@ -66,18 +66,13 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     n_older = int(older[0].max(initial=-1)) + 1
     connection.execute(f"""
         CREATE TABLE numbered_sets AS
-        WITH ids AS (
-            SELECT code, unnest({ITEMS}) AS id
-            FROM candidate_codes JOIN named_sets USING ({schema.CANDIDATES})
-        ),
-        new AS (
+        WITH new AS (
             SELECT code, list_sort(list(DISTINCT CAST(number AS BIGINT))) AS members
-            FROM ids JOIN items ON id = CAST({schema.ITEM_ID} AS VARCHAR) GROUP BY code
+            FROM (SELECT *, unnest({ITEMS}) AS id FROM named_sets)
+            JOIN candidate_codes USING ({schema.CANDIDATES})
+            JOIN items ON id = CAST({schema.ITEM_ID} AS VARCHAR) GROUP BY code
         ),
-        old AS (
-            SELECT "set" AS number, list(item ORDER BY item) AS members FROM older_sets
-            GROUP BY "set"
-        )
+        old AS (SELECT number, list(item ORDER BY item) AS members FROM older_sets GROUP BY number)
         SELECT code, members, coalesce(number, {n_older - 1} + dense_rank() OVER
             (PARTITION BY number IS NULL ORDER BY members)) AS number
         FROM new LEFT JOIN old USING (members)

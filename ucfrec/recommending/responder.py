@@ -225,10 +225,9 @@ class Responder:
         )
         for question, count, *lists in zip(questions, counts, *columns, strict=True):
             items, logs, chances = (values[: min(count, question.k)] for values in lists)
-            answer = Answer(items, logs, chances, question.request_id, *self._source)
-            if question.candidates is not None:
-                answer = answer._replace(candidates=self.trained.items.ids[question.candidates])
-            yield answer
+            numbers = question.candidates
+            ids = None if numbers is None else self.trained.items.ids[numbers]
+            yield Answer(items, logs, chances, question.request_id, *self._source, candidates=ids)
 
 
 class _Arm(NamedTuple):

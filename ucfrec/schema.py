@@ -16,6 +16,8 @@ REQUEST_ID: Final = "request_id"
 """Rows of one request are one decision; without it, those of a user at one time."""
 POSITION: Final = "position"
 """Place of an item in the list of its decision, in any numbers that ascend."""
+CANDIDATES: Final = "candidates"
+"""What was on offer, a list of item_ids or the name of one; in a store, the number of the set."""
 ACTION: Final = "action"
 """A list of floats, in logs whose actions are vectors instead of items."""
 OBSERVATION: Final = "observation"
@@ -60,6 +62,7 @@ STEP_DTYPES: Final = {
     PLACE: "<i4",
     SESSION_BEGAN: "<i8",
     EXCLUDES_SEEN: "|u1",
+    CANDIDATES: "<i4",
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 

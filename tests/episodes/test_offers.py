@@ -20,44 +20,58 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 
 ITEMS, TIMES = st.integers(0, 5), st.integers(0, 12)
 INTERVALS = st.lists(st.tuples(ITEMS, TIMES, TIMES).filter(lambda row: row[1] < row[2]), max_size=9)
-TIME_LISTS = st.lists(TIMES, min_size=1, max_size=6)
+SETS = st.lists(st.sets(ITEMS, min_size=1), min_size=1, max_size=4)
+DECISIONS = st.lists(st.tuples(TIMES, st.integers(-1, 3)), min_size=1, max_size=6)
 
 
-def make_offers(intervals: list[tuple[int, int, int]]) -> Offers:
-    return Offers.of(6, np.array(intervals, dtype=np.int64).reshape(-1, 3).T)
+def make_offers(intervals: list[tuple[int, int, int]], sets: list[set[int]]) -> Offers:
+    members = [(number, item) for number, items in enumerate(sets) for item in sorted(items)]
+    rows = np.array(intervals, dtype=np.int64).reshape(-1, 3).T
+    return Offers.of(6, rows, np.array(members, dtype=np.int64).reshape(-1, 2).T.copy())
 
 
-@given(intervals=INTERVALS, times=TIME_LISTS, chosen=st.sets(ITEMS, min_size=1))
-def test_an_item_is_offered_in_any_of_its_intervals(intervals, times, chosen):
+@given(intervals=INTERVALS, sets=SETS, decisions=DECISIONS, chosen=st.sets(ITEMS, min_size=1))
+def test_an_item_is_offered_in_any_of_its_intervals_and_if_it_is_a_candidate(
+    intervals, sets, decisions, chosen
+):
+    offers = make_offers(intervals, sets)
+    decisions = [(time, number if number < len(sets) else -1) for time, number in decisions]
+    times, numbers = torch.tensor(decisions).T
     expected = [
         [
-            any(begin <= time < end for i, begin, end in intervals if i == item)
-            or all(i != item for i, _, _ in intervals)
+            (
+                any(begin <= time < end for i, begin, end in intervals if i == item)
+                or all(i != item for i, _, _ in intervals)
+            )
+            and (number < 0 or item in sets[number])
             for item in range(6)
         ]
-        for time in times
+        for time, number in decisions
     ]
-    offer = make_offers(intervals).at(torch.tensor(times))
+    offer = offers.at(times, numbers)
     assert offer.mask().tolist() == expected
     for item in range(6):
         column = [row[item] for row in expected]
-        assert offer.has(torch.full_like(offer.times, item)).tolist() == column
+        assert offer.has(torch.full_like(times, item)).tolist() == column
     some = torch.tensor(sorted(chosen))
     assert torch.equal(offer.mask(some), offer.mask()[:, some])
 
 
 def test_a_file_is_read_as_written_and_refused_when_it_is_of_another_catalogue(tmp_path: Path):
-    file, offers = tmp_path / "offers", make_offers([(1, 2, 9), (1, 10, 11), (4, 0, 3)])
+    file, intervals = tmp_path / "offers", [(1, 2, 9), (1, 10, 11), (4, 0, 3)]
+    offers = make_offers(intervals, [{0, 1}, {3}])
     offers.save(file)
     loaded = Offers.load(file, 6)
-    for name, values in vars(offers).items():
-        assert torch.equal(getattr(loaded, name), values)
+    for name in ("begin", "end", "later", "sets"):
+        assert torch.equal(getattr(loaded, name), getattr(offers, name))
     assert loaded.intervals.T.tolist() == [[1, 2, 9], [4, 0, 3], [1, 10, 11]]
     with pytest.raises(InputError, match="not of 7 items"):
         Offers.load(file, 7)
     tensors, _ = load_tensors(file)
-    for item in (-1, 6):
-        save_tensors(file, {**tensors, "later": torch.tensor([[item], [2], [3]])}, {})
+    for name, first, item in (("later", 0, 6), ("later", 0, -1), ("sets", 1, 9), ("sets", 1, 1)):
+        damaged = tensors[name].clone()
+        damaged[first, 0] = item
+        save_tensors(file, {**tensors, name: damaged}, {})
         with pytest.raises(InputError, match="damaged"):
             Offers.load(file, 6)
 

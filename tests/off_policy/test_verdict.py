@@ -131,7 +131,7 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     assert not verdict.lift.is_reliable
     assert "the logs lack choices that the policy makes" in str(verdict)
     assert f"the value lies between {diagnosis.bounds[0]:.4g}" in str(verdict)
-    assert "add --filter-seen" in str(verdict)
+    assert "log excludes_seen and candidates" in str(verdict)
 
 
 def test_weights_are_tested_by_segment() -> None:

@@ -4,13 +4,17 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from tests.support.killed import kills
-from tests.support.served import histories, requests_of, responder, with_rule
+from tests.support.served import histories, requests_of, responder, tagged_log, with_rule
+from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
+from ucfrec.logs.join import join_feedback
+from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Request
 from ucfrec.recommending.responder import Answer
@@ -40,7 +44,9 @@ def rows_of(given: dict[int, Answer]) -> list[tuple[object, ...]]:
 def read(folder: Path) -> list[tuple[object, ...]]:
     frame = pd.concat([pd.read_parquet(file) for file in sorted(folder.glob("*.parquet"))])
     assert frame.timestamp.between((time.time() - 600) * 1000, time.time() * 1000).all()
-    return list(frame.drop(columns=["timestamp", "arm"]).itertuples(index=False, name=None))
+    assert (frame.candidates == "").all()
+    columns = frame.drop(columns=["timestamp", "arm", "candidates"])
+    return list(columns.itertuples(index=False, name=None))
 
 
 def test_files_rotate_by_size_and_by_time(trained: TrainedPolicy, tmp_path: Path) -> None:
@@ -99,6 +105,49 @@ def test_recommend_writes_the_exposures_of_its_recommendations(
         assert exposures[name].tolist() == recommended[name].tolist()
     assert set(exposures.run) == {trained.fingerprint}
     assert set(exposures.rule) == {with_rule(trained, temperature=1.0).hash}
+
+
+@pytest.mark.parametrize("served", [False, True])
+def test_weights_of_a_policys_own_log_are_1_given_the_candidates(
+    trained: TrainedPolicy, tmp_path: Path, served: bool
+) -> None:
+    rule, shown = with_rule(trained, temperature=1.0), tmp_path / "shown"
+    file, joined = tmp_path / "rows.parquet", tmp_path / "log.parquet"
+    log, ids = tagged_log(), trained.items.ids.tolist()
+    log = log[log.user_id < 130]
+    log.to_parquet(file)
+    if served:
+        sets = [[*ids[::2], ids[0]], ids[:12], ids[::2][::-1], None]
+        requests = [
+            Request.model_validate(request | {"candidates": sets[n % 4]})
+            for n, request in enumerate(requests_of(log))
+        ]
+        found = responder(trained, k=1, rule=rule).answers(requests)
+        # A minute after the last row, so that sessions go on.
+        clock = iter(log.groupby("user_id").timestamp.max() / 1000 + 60).__next__
+        with closing(ExposureLog(shown, trained, clock=clock)) as exposures:
+            for request, answer in zip(requests, found, strict=True):
+                assert isinstance(answer, Answer)
+                exposures.add(request.user_id, answer)
+    else:
+        shown.mkdir()
+        pd.DataFrame({"item_id": ids[::2]}).to_parquet(tmp_path / "half.parquet")
+        command = f"recommend {trained.folder} {file} --k 1 --temperature 1 --new-session --out"
+        command += f" {tmp_path}/out --exposures {shown}/a --candidates {tmp_path}/half.parquet"
+        assert main(command.split()) == 0
+        (shown / "a").rename(shown / "a.parquet")
+    rows = pd.concat(map(pd.read_parquet, log_files([shown])))
+    clicks = rows[["user_id", "item_id", "timestamp"]].assign(reward=1.0)
+    clicks.to_parquet(tmp_path / "clicks.parquet")
+    join_feedback([shown], [tmp_path / "clicks.parquet"], joined, 1)
+    assert len(pd.read_parquet(tmp_path / "log.candidates.parquet")) == 1 + served
+    policy = Recommender.load(trained.folder)
+    scores = policy.score(joined, rule=rule, filter_seen=True)
+    assert scores.user_id.nunique() == len(scores) == 30
+    np.testing.assert_allclose(scores.probability, scores.propensity, rtol=1e-5)
+    mapping = LogMapping({"candidates": ""})
+    scores = policy.score(joined, rule=rule, filter_seen=True, mapping=mapping)
+    assert (scores.probability / scores.propensity).mean() < 0.8
 
 
 @pytest.mark.slow

@@ -21,14 +21,19 @@ PAUSES = {"a session goes on": 60_000, "a session begins": 7_200_000}
 @pytest.mark.parametrize("k", [1, 10])
 @pytest.mark.parametrize("filter_seen", [False, True])
 @pytest.mark.parametrize("pause", PAUSES.values(), ids=PAUSES)
-def test_weights_are_one(tmp_path: Path, k: int, filter_seen: bool, pause: int) -> None:
+@pytest.mark.parametrize("among", [None, range(0, 24, 2)], ids=["all", "candidates"])
+def test_weights_are_one(
+    tmp_path: Path, k: int, filter_seen: bool, pause: int, among: range | None
+) -> None:
     trained, log = trained_run(tmp_path), tagged_log()
     policy, rng = Recommender.load(tmp_path / "run"), np.random.default_rng(0)
     rule = DecisionRule(trained.rule.target, reward_weight=0.5, temperature=1.0)
-    for day in range(2):
+    days = range(1 if among and filter_seen else 2)  # then all candidates are seen
+    for day in days:
         shown, feedback = tmp_path / f"{day}.parquet", tmp_path / f"f{day}.parquet"
         at = int(log.timestamp.max()) + pause
-        policy.recommend(log, k, filter_seen=filter_seen, rule=rule, at=at, exposures=shown)
+        how = {"filter_seen": filter_seen, "candidates": among, "rule": rule, "at": at}
+        policy.recommend(log, k, **how, exposures=shown)
         rows = pd.read_parquet(shown)[["user_id", "item_id", "timestamp"]]
         likes = rows[rng.random(len(rows)) < 0.4].assign(reward=1.0)
         likes.assign(timestamp=likes.timestamp + 500).to_parquet(feedback)
@@ -36,10 +41,10 @@ def test_weights_are_one(tmp_path: Path, k: int, filter_seen: bool, pause: int) 
         joined = pd.read_parquet(tmp_path / f"log{day}.parquet")
         joined["user_id"] = joined.user_id.astype(log.user_id.dtype)
         log = pd.concat([log, joined[["user_id", "item_id", "timestamp", "reward", "position"]]])
-    logs = [tmp_path / f"log{day}.parquet" for day in range(2)]
+    logs = [tmp_path / f"log{day}.parquet" for day in days]
     with read_logged_sessions(trained, logs, LogMapping(), keep_unknown=True) as logged:
         scored = pd.concat(score(trained, logged, rule))
         np.testing.assert_allclose(scored.probability, scored.propensity, rtol=1e-4)
         report = evaluate_off_policy(trained, logged, rule=rule, seed=0)
     weights = {row.method: row.metrics["effective_sessions"] for row in report.rows}
-    assert weights["IPS"] == pytest.approx(weights["logged"], rel=1e-3)
+    assert weights["PDIS"] == pytest.approx(weights["logged"], rel=1e-3)

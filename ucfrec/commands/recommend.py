@@ -161,7 +161,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
                         yield batch
                         bar.update(len(batch.users))
 
-                how |= {"candidates": self._read_candidates(trained), "index": index}
+                candidates = self._read_candidates(trained)
+                how |= {"candidates": candidates, "index": index}
                 decisions = decide(trained, count_users(), self.k, **how)
                 frames: Iterator[pd.DataFrame] = (frame for frame, _ in decisions)
                 if self.exposures:
@@ -170,6 +171,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
                         trained,
                         rule.hash,
                         decisions,
+                        candidates,
                         excludes_seen=not self.keep_seen,
                         at=self.at,
                     )

@@ -329,12 +329,14 @@ class UserRows:
         return cls(later, earlier, source, first, place)
 
     def values(self, name: str, source: IntArray) -> Array:
-        """Values of a step column at sources of any shape; see `source`."""
+        """Values of a step column at sources of any shape; see `source`. Of candidates, whose sets
+        have other numbers in an earlier store, its rows have none."""
         later, earlier = self.later, self.earlier
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
         if earlier is not None and (source < 0).any():
-            values[source < 0] = -1 if name == schema.SESSION_BEGAN else 0
-            if name in earlier.record.columns:
+            values[source < 0] = -1 if name in (schema.SESSION_BEGAN, schema.CANDIDATES) else 0
+            # Sets of candidates are numbered by each store.
+            if name in earlier.record.columns and name != schema.CANDIDATES:
                 steps = earlier.locate(-1 - source[source < 0])
                 values[source < 0] = earlier.step_values(name, *steps)
         return values

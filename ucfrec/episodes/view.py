@@ -351,15 +351,19 @@ class EpisodeView:
     @property
     def has_offers(self) -> bool:
         """Whether items come and go; otherwise all are always on offer."""
-        return self._columns.offers is not None
+        offers = self._columns.offers
+        return offers is not None and bool(offers.intervals.size)
 
     def offer(self, episodes: IntArray, steps: IntArray) -> Offer | None:
         """What was on offer at steps of episodes, as `step_values`; None for everything."""
         offers = self._columns.offers
         if offers is None:
             return None
-        times = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
-        return Offer(offers, torch.from_numpy(times))
+        times, sets = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64), None
+        if schema.CANDIDATES in self.record.columns:
+            numbers = self.step_values(schema.CANDIDATES, episodes, steps)
+            sets = torch.from_numpy(numbers.astype(np.int64))
+        return offers.at(torch.from_numpy(times), sets)
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""

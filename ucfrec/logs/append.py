@@ -24,6 +24,7 @@ from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
+from ucfrec.logs.candidates import list_set_files
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.features import encode_ids, note_lacking
 from ucfrec.logs.mapping import LogMapping, log_files
@@ -38,7 +39,7 @@ SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
 _FILL = {
     schema.PROPENSITY: np.nan,
-    schema.SESSION_BEGAN: -1,
+    **dict.fromkeys((schema.SESSION_BEGAN, schema.CANDIDATES), -1),
     **dict.fromkeys((schema.IS_RANDOM, schema.PLACE, schema.EXCLUDES_SEEN), 0),
 }
 """Step columns that some logs of a store may lack, and what their steps have instead."""
@@ -223,9 +224,10 @@ def _describe_inputs(
     """What the grown store depends on, to know it again; the keys name it where it differs."""
     tables = (*mapping.item_features, *mapping.user_features)
     feature_files = (file for table in tables for file in log_files(table.files))
+    set_files = list_set_files(mapping, files)
     return {
         "another run's store": old.fingerprint,
-        "other logs": [file_checksum(file) for file in files],
+        "other logs": [file_checksum(file) for file in (*files, *set_files)],
         "other columns or conditions in the mapping": mapping.remember(),
         "other feature tables in the mapping": [file_checksum(file) for file in feature_files],
         "another window": options.window_ms,
@@ -315,8 +317,9 @@ def _write(
 
     typed = log.rows.log
     left = [shard for shard in shards if shard.stays.any()]
-    has = {*typed.columns, *([schema.PLACE] if log.rows.has_lists else [])}
-    added = [name for name in _FILL if name in has and name not in old.columns]
+    present = {*typed.columns} - ({schema.CANDIDATES} if log.sets is None else set())
+    present |= {schema.PLACE} if log.rows.has_lists else set()
+    added = [name for name in _FILL if name in present and name not in old.columns]
     if schema.OBSERVATION in old.columns and schema.OBSERVATION not in typed.columns:
         raise InputError(
             f"{typed.name} has no observation, {store} has; name its column with --column"
@@ -324,10 +327,9 @@ def _write(
     _move_train_counts(typed, shards)
     fill = {name: float(_FILL.get(name, np.nan)) for name in (*old.columns, *added)}
     with progress(log.report["steps"], "write the new shards", "steps") as bar:
-        offers = log.read_offers(store)
-        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, offers)
-    if offers is not None:
-        offers.save(folder / OFFERS)
+        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, log.offers, log.sets)
+    if log.offers is not None:
+        log.offers.save(folder / OFFERS)
     new = writer.finish(log.report["reward"], log.report, write_ids(typed, folder))
     expired = sum(int(shard.lengths[~shard.stays].sum()) for shard in shards)
     report = {**log.report, **counts, "expired_steps": expired}

@@ -52,7 +52,7 @@ _CLOSED = {
 _OF_JOIN = (
     *(schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP),
     *(schema.REQUEST_ID, schema.POSITION, schema.PROPENSITY),
-    *(schema.SESSION_BEGAN, schema.EXCLUDES_SEEN),
+    *(schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, schema.CANDIDATES),
 )
 """Log columns that logs of `join` have."""
 _NAME = re.compile(r"[^\W\d]\w*")

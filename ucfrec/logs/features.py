@@ -14,6 +14,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import ALWAYS, DISTINCT_TAGS, OFFERS, TAGS_PER_ITEM
 from ucfrec.errors import InputError, warn_user
+from ucfrec.logs.candidates import number_sets
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
 from ucfrec.logs.sessions import ID_TABLES
@@ -31,7 +32,7 @@ from ucfrec.logs.tables import (
     quote_name,
     raw_name,
 )
-from ucfrec.logs.typed import cast_value
+from ucfrec.logs.typed import TypedLog, cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -124,20 +125,24 @@ def _list_times(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> 
 
 
 def read_offers(
-    connection: duckdb.DuckDBPyConnection,
+    log: TypedLog,
     names: Sequence[str],
-    n_items: int,
     store: Path | None,
-) -> "Offers | None":
-    """When the items of a store are available, as of feature tables; items that these lack as in
-    the older `store`. None where nobody says."""
-    tables = _list_times(connection, names)
+    grows: bool,
+) -> tuple["Offers | None", IntArray | None]:
+    """What was on offer in the steps of a log, after `number_ids`; None for everything.
+
+    Items are available as the feature tables `names` say, and items that these lack as in a
+    `store`; if it `grows`, sets of candidates follow its own. The second value is the first of
+    `number_sets`, if the log has candidates.
+    """
+    connection, tables = log.connection, _list_times(log.connection, names)
     has_older = store is not None and (store / OFFERS).is_file()
-    if not tables and not has_older:
-        return None
+    if not (tables or has_older or schema.CANDIDATES in log.columns):
+        return None, None
     from ucfrec.episodes.offers import Offers  # imports torch
 
-    intervals = np.zeros((3, 0), dtype=np.int64)
+    intervals, sets = (np.zeros((rows, 0), dtype=np.int64) for rows in (3, 2))
     begin, until = (f"coalesce({name}, {n})" for name, n in zip(_TIMES, ALWAYS, strict=True))
     for name in tables:
         rows = connection.sql(
@@ -146,9 +151,13 @@ def read_offers(
         ).fetchnumpy()
         intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
     if store is not None and has_older:
-        older = Offers.load(store / OFFERS).intervals
-        intervals = np.hstack([intervals, older[:, ~np.isin(older[0], intervals[0])]])
-    return Offers.of(n_items, intervals)
+        older = Offers.load(store / OFFERS)
+        rest, sets = older.intervals, older.sets.numpy() if grows else sets
+        intervals = np.hstack([intervals, rest[:, ~np.isin(rest[0], intervals[0])]])
+    numbers, sets = number_sets(log, sets) or (None, sets)
+    (n_items,) = log.one("SELECT count(*) FROM items")
+    some = intervals.size or sets.size
+    return Offers.of(n_items, intervals, sets) if some else None, numbers
 
 
 def count_features(

@@ -12,6 +12,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.parquet import require_table_names, table_writer
+from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.summary import MANY, note_undefined
@@ -39,10 +40,15 @@ _OTHERS = {
     schema.RUN: "VARCHAR",
     schema.RULE: "VARCHAR",
     schema.ARM: "VARCHAR",
+    schema.CANDIDATES: "VARCHAR",
 }
 """Columns of exposures besides the keys, and their DuckDB types."""
 _EXPOSURE = (*_KEYS, *_OTHERS)
-_ABSENT = {schema.ARM: "''", schema.SESSION_BEGAN: "NULL::BIGINT", schema.EXCLUDES_SEEN: "false"}
+_ABSENT = {
+    **dict.fromkeys((schema.ARM, schema.CANDIDATES), "''"),
+    schema.SESSION_BEGAN: "NULL::BIGINT",
+    schema.EXCLUDES_SEEN: "false",
+}
 """Columns that exposures may lack, and SQL of what they then are."""
 _MEASURED = (schema.TIMESTAMP, schema.PROPENSITY)
 """Columns that may differ where an exposure is written twice."""
@@ -117,7 +123,8 @@ def join_feedback(
     files = [*shown_files, *feedback_files]
     require_other_files([out], files)
     mapping = mapping or LogMapping()
-    with engine(files, Path(gettempdir()), memory_limit) as connection:
+    set_files = list_set_files(LogMapping(), shown_files)
+    with engine([*files, *set_files], Path(gettempdir()), memory_limit) as connection:
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
         with explain_errors(connection, (*shown_tables, *tables), out.parent):
@@ -133,6 +140,11 @@ def join_feedback(
                 for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )
             connection.execute(f"CREATE TABLE matches AS {' UNION ALL '.join(matches)}")
+            sets = connection.sql(
+                f"FROM ({select_named_sets(connection, set_files)}) "
+                f"SEMI JOIN exposures USING ({schema.CANDIDATES}) ORDER BY {schema.CANDIDATES}"
+            )
+            write_sets(out, sets.to_arrow_table())
             _write(connection, columns, further, out)
             ((exposure_rows, written, rows, matched, with_feedback),) = connection.sql(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
@@ -196,8 +208,7 @@ def _select_others(table: Table, keys: Table, further: _Further) -> str:
     for name, kind in _OTHERS.items():
         if name in names and kind == "VARCHAR":
             texts.append(names[name])
-            absent = "''" if name == schema.ARM else "NULL"
-            values[name] = f"coalesce({table.text_of(names[name])}, {absent})"
+            values[name] = f"coalesce({table.text_of(names[name])}, {_ABSENT.get(name, 'NULL')})"
         elif name in names:
             values[name] = f"CAST({quote_name(names[name])} AS {kind})"
     values |= {alias: quote_name(names[key]) for key, alias in more.items()}
@@ -306,7 +317,7 @@ def _feedback_columns(
 
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
-    absent = dict.fromkeys(OPTIONAL_COLUMNS, "")
+    absent = {name: "" for name in OPTIONAL_COLUMNS if name != schema.SESSION_ID}
     return replace(mapping, columns={**mapping.columns, **absent})
 
 

@@ -34,7 +34,10 @@ OPTIONAL_COLUMNS: Final = (
     schema.POSITION,
     schema.SESSION_BEGAN,
     schema.EXCLUDES_SEEN,
+    schema.CANDIDATES,
 )
+SETS_SUFFIX: Final = ".candidates.parquet"
+"""Ending of the file of sets of candidates that lies beside exposures and logs of `join`."""
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
 SESSIONS: Final = get_args(schema.SessionBy)
@@ -98,6 +101,9 @@ class LogMapping:
     """SQL condition over the files' columns; rows that do not fulfil it are excluded."""
     partitions: bool = False
     """Whether names of folders such as `country=DE` are columns."""
+    candidate_sets: tuple[str | Path, ...] = ()
+    """Tables of the sets that the log column `candidates` names: `candidates`, and `items`, a list
+    of item_ids. Of exposures and logs of `join` they are found without it."""
     remembered: "LogMapping | None" = None
     """Mapping of the log that a run was trained on. Its columns, time format and condition count
     where nothing else is given and the files have the columns they need."""
@@ -235,6 +241,9 @@ def read_mapping(path: Path) -> LogMapping:
         values["columns"] = {name: Expression(text, origin) for name, text in columns.items()}
         for name in {"reward", "where"} & values.keys():
             values[name] = Expression(values[name], origin)
+        if sets := values.get("candidate_sets"):
+            sets = [sets] if isinstance(sets, str) else sets
+            values["candidate_sets"] = tuple(_beside(path, file) for file in sets)
         for kind in {"item_features", "user_features"} & values.keys():
             for table in values[kind]:
                 _require_keys(f"[[{kind}]]", table, FeatureTable)
@@ -281,7 +290,8 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs (or a single one), each once.
 
     A folder stands for all log files in it and its sub-folders, by name, but for stores, runs, and
-    those whose names begin with a dot or an underscore. Raises InputError if a path is missing,
+    those whose names begin with a dot or an underscore. Sets of candidates are no logs, and left
+    out beside some. Raises InputError if a path is missing,
     matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
@@ -302,7 +312,13 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
         files |= dict.fromkeys(matches)
     if not files:
         raise InputError("no log was named; give Parquet or CSV files, folders or globs")
-    return tuple(files)
+    logs = tuple(file for file in files if not file.name.endswith(SETS_SUFFIX))
+    return logs or tuple(files)
+
+
+def sets_beside(file: Path) -> Path:
+    """Where the sets of candidates are that a file of exposures, or a log of `join`, names."""
+    return file.with_suffix(SETS_SUFFIX)
 
 
 def table_name(file: Path) -> str:

@@ -18,10 +18,12 @@ import pyarrow as pa
 from pydantic import Field, InstanceOf
 
 from ucfrec import schema
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
+from ucfrec.logs.candidates import list_set_files
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
     count_features,
@@ -158,20 +160,20 @@ def prepare(
             explain_errors(log.rows.log.connection, log.rows.log.tables, out.parent),
         ):
             typed, report = log.rows.log, log.report
-            offers = log.read_offers(None)
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(log.rows, log.cut, folder, bar, offers=offers)
-            if offers is not None:
-                offers.save(folder / OFFERS)
+                writer = sessions.write_steps(
+                    log.rows, log.cut, folder, bar, offers=log.offers, sets=log.sets
+                )
+            if log.offers is not None:
+                log.offers.save(folder / OFFERS)
             ids = sessions.write_ids(typed, folder)
             for name, tables in log.features.items():
                 if tables:
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]
             record = writer.finish(report["reward"], report, ids)
             if like is not None and typed.key == schema.ITEM_ID:
-                for name in (ITEM_STATES, OFFERS):
-                    if (like / name).is_file():
-                        shutil.copy(like / name, folder / name)
+                if (like / ITEM_STATES).is_file():
+                    shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
             elif typed.key == schema.ITEM_ID:
                 from ucfrec.logs.items import write_item_states  # imports scipy
 
@@ -205,14 +207,9 @@ class PreparedLog:
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
-
-    def read_offers(self, store: Path | None) -> "Offers | None":
-        """When items are available; of those that are in a `store` alone, as it says."""
-        if schema.ITEM_ID not in self.features:
-            return None
-        connection, names = self.rows.log.connection, self.features[schema.ITEM_ID]
-        ((n_items,),) = connection.sql("SELECT count(*) FROM items").fetchall()
-        return read_offers(connection, names, n_items, store)
+    offers: "Offers | None"
+    sets: IntArray | None
+    """As of `read_offers`."""
 
 
 @contextmanager
@@ -241,7 +238,7 @@ def read_log(
         file for tables in tables_of_ids.values() for t in tables for file in log_files(t.files)
     ]
     id_files = [store / file for _, _, file in sessions.ID_TABLES] if store else []
-    inputs = (*files, *id_files, *feature_files)
+    inputs = (*files, *id_files, *feature_files, *list_set_files(mapping, files))
     with (
         scratch_folder(spill, "sorted") as scratch,
         engine(inputs, spill, options.memory_limit) as connection,
@@ -287,6 +284,9 @@ def read_log(
                 report = {"reward": reward, **summary.build_report(rows, cut, counts)}
                 summary.note_oddities(rows, report, mapping)
                 stage.update()
+                offers, sets = None, None
+                if log.key == schema.ITEM_ID:
+                    offers, sets = read_offers(log, features.get(log.key, ()), store, grows)
                 for name, names in features.items():
                     require_known_ids(connection, tables_of_ids[name], names, name, not grows)
                 report |= {name: getattr(options, name) for name in _REMEMBERED}
@@ -299,7 +299,7 @@ def read_log(
                     },
                 }
                 stage.update()
-        yield PreparedLog(rows, cut, features, report, scratch)
+        yield PreparedLog(rows, cut, features, report, scratch, offers, sets)
 
 
 def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:

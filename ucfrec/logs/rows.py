@@ -28,7 +28,7 @@ from ucfrec.logs.engine import to_numpy
 from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, quote
 from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
 
-USER, ITEM, SESSION = "user_code", "item_code", "session"
+USER, ITEM, SESSION, CANDIDATE_SET = "user_code", "item_code", "session", "candidate_set"
 """Columns of the sorted rows: numbers of the ids, in the order of the ids."""
 _REQUEST = "request"
 """Column of a hash of the request."""
@@ -36,6 +36,7 @@ CODES: Final = {
     schema.USER_ID: ("user_codes", USER),
     schema.ITEM_ID: ("item_codes", ITEM),
     schema.SESSION_ID: ("session_codes", SESSION),
+    schema.CANDIDATES: ("candidate_codes", CANDIDATE_SET),
 }
 """Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
 FAULTY: Final = "faulty"
@@ -136,8 +137,8 @@ class SortedRows:
     file: RowFile
     """The rows in order of user and time, all of a user in one batch: `USER`, `ITEM` or `action`,
     `timestamp`, `reward` (float64), `row` (position in the files) and, if the log has them,
-    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown) and `is_random`; and
-    `place`, in the row's decision."""
+    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown), `is_random`,
+    `CANDIDATE_SET` (−1 for none), and `place`, in the row's decision."""
     observations: RowVectors | None
     dropped: dict[str, int]
     """Number of dropped rows by reason."""
@@ -356,9 +357,9 @@ def mark_faults(
 def order_rows(log: TypedLog, rows: str) -> str:
     """SQL of the rows without a fault in order of user, time, the hash of `TIE` and choice, from a
     relation as of `mark_faults`, beside which are the tables of `code_tables`."""
-    tables = code_tables(log)
+    tables, optional = code_tables(log), (schema.SESSION_ID, schema.CANDIDATES)
     joins = [
-        f"{'LEFT' if name == schema.SESSION_ID else ''} JOIN {table} USING ({name})"
+        f"{'LEFT' if name in optional else ''} JOIN {table} USING ({name})"
         for name, table in tables.items()
     ]
     columns = {CODES[name][1]: f"{table}.code" for name, table in tables.items()}
@@ -376,6 +377,8 @@ def order_rows(log: TypedLog, rows: str) -> str:
     columns |= {name: name for name in whole if name in log.columns}
     if schema.SESSION_BEGAN in log.columns:
         columns[schema.SESSION_BEGAN] = f"coalesce({schema.SESSION_BEGAN}, -1)"
+    if schema.CANDIDATES in tables:
+        columns[CANDIDATE_SET] = f"coalesce({columns[CANDIDATE_SET]}, -1)"
     if schema.PROPENSITY in log.columns:
         columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
     if schema.REQUEST_ID in log.columns:
@@ -474,7 +477,7 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     finite = np.abs(rewards) <= MAX_FLOAT
     rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
     keys = [~finite, np.where(finite, rule[duplicates], 0)]
-    for name in (schema.OBSERVATION, schema.PROPENSITY, "session", schema.IS_RANDOM):
+    for name in (schema.OBSERVATION, schema.PROPENSITY, SESSION, schema.IS_RANDOM, CANDIDATE_SET):
         if name in rows:
             keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
     return [rows["row"], *keys[::-1]]

@@ -20,7 +20,7 @@ from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
-from ucfrec.logs.rows import CODES, ITEM, SESSION, USER, SortedRows
+from ucfrec.logs.rows import CANDIDATE_SET, CODES, ITEM, SESSION, USER, SortedRows
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import Progress
@@ -407,11 +407,13 @@ def write_steps(
     first_shard: int = 0,
     fill: Mapping[str, float] = MappingProxyType({}),
     offers: "Offers | None" = None,
+    sets: IntArray | None = None,
 ) -> StoreWriter:
     """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
-    out. Empty for those of the log. Warns of steps whose item is not available, as of `offers`.
+    out. Empty for those of the log. `sets` has the set of candidates of each code, as of
+    `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
     """
     unavailable = total = 0
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
@@ -419,18 +421,23 @@ def write_steps(
     items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
     for episodes in read_episodes(rows, cut):
         columns, lengths = episodes.rows, episodes.lengths
+        count = int(lengths.sum())
         if ITEM in columns:
             columns[schema.ITEM] = items[columns[ITEM]]
-        if offers is not None and lengths.size:
-            unavailable += offers.count_unavailable(columns[schema.ITEM], columns[schema.TIMESTAMP])
-            total += len(columns[schema.ITEM])
+        if sets is not None:
+            columns[schema.CANDIDATES] = sets[columns[CANDIDATE_SET]]
+        if offers is not None and count:
+            chosen = columns.get(schema.CANDIDATES, np.full(count, -1))
+            unavailable += offers.count_unavailable(
+                columns[schema.ITEM], columns[schema.TIMESTAMP], chosen
+            )
+            total += count
         if rows.observations is not None:
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
         if not rows.has_lists:
             del columns[schema.PLACE]
         names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
         steps = {name: columns[name] for name in names}
-        count = int(lengths.sum())
         steps |= {n: np.full(count, value) for n, value in fill.items() if n not in steps}
         first = np.zeros(count, dtype=bool)
         first[np.cumsum(lengths) - lengths] = True
@@ -448,7 +455,8 @@ def write_steps(
     if unavailable:
         warn_user(
             f"{log.name}: {unavailable:,} of {total:,} rows show an item at a time at which the "
-            "table of items says it is not available; check the time zones of both"
+            "table of items says it is not available (check the time zones of both), or one that "
+            "is not among the row's candidates"
         )
     return writer
 

@@ -58,7 +58,10 @@ _TYPES = {
     schema.POSITION: "DOUBLE",
     schema.SESSION_BEGAN: "BIGINT",
     schema.EXCLUDES_SEEN: "BOOLEAN",
+    schema.CANDIDATES: "VARCHAR",
 }
+KEY_OF_LIST: Final = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
+"""SQL of the name of a set of candidates that is a list in the log."""
 _DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
 _OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
 
@@ -262,7 +265,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         name: value.columns[0]
         for name, value in bound.items()
         if not table.columnar and value.is_column and value.columns[0] in dict(table.types)
-        if name in _IDS or (name == schema.TIMESTAMP and time_format)
+        if name in (*_IDS, schema.CANDIDATES) or (name == schema.TIMESTAMP and time_format)
     }
     for name, column in raw.items():
         bound[name] = Bound(quote_name(raw_name(column)), "VARCHAR", (), False)
@@ -364,6 +367,11 @@ def cast_value(
         if is_number(kind):
             return f"CAST({sql} AS DOUBLE)", "DOUBLE"
         remedy = "use a number"
+    elif name == schema.CANDIDATES:
+        if (ids := kind.removesuffix("[]")) in ("VARCHAR", "UUID") or is_integer(ids):
+            key = KEY_OF_LIST if kind != ids else "nullif(CAST({} AS VARCHAR), '')"
+            return key.format(sql), "VARCHAR"
+        remedy = "use a list of item_ids, or integers or text that name a set of candidates"
     else:
         if is_number(kind) or kind == "BOOLEAN":
             return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"

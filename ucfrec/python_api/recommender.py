@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final, Self
 
+import numpy as np
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
@@ -288,6 +289,7 @@ class Recommender:
             sorted order; fewer rows if fewer items remain, as with less than k candidates.
         """
         trained = self.trained
+        allowed = None if candidates is None else list(candidates)
         decisions = decide(
             trained,
             read_histories(trained, histories, mapping, users),
@@ -295,7 +297,7 @@ class Recommender:
             rule=rule,
             seed=seed,
             filter_seen=filter_seen,
-            candidates=candidates,
+            candidates=allowed,
             skip_unknown=skip_unknown,
             new_session=new_session,
             at=at,
@@ -309,6 +311,7 @@ class Recommender:
                     trained,
                     hashed,
                     decisions,
+                    None if allowed is None else np.asarray(allowed),
                     excludes_seen=filter_seen,
                     at=at,
                 )

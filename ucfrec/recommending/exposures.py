@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,12 +15,14 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+import xxhash
 
 from ucfrec import schema
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
+from ucfrec.logs.candidates import ITEMS, write_sets
 from ucfrec.recommending.recommend import RANK, read_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -49,8 +51,23 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             schema.RUN: pa.string(),
             schema.RULE: pa.string(),
             schema.ARM: pa.string(),
+            schema.CANDIDATES: pa.string(),
         }
     )
+
+
+def name_set(candidates: Array | None) -> str:
+    """16 hexadecimal digits that name a set of ids, in any order; empty for None, everything."""
+    if candidates is None:
+        return ""
+    ids = map(str, np.unique(candidates).tolist())
+    return xxhash.xxh3_64_hexdigest("\n".join(ids).encode())
+
+
+def _tabulate_sets(sets: Mapping[str, Array | None]) -> pa.Table:
+    """Sets of candidates by their names, but for None, everything."""
+    lists = {n: np.unique(ids).astype(str).tolist() for n, ids in sets.items() if ids is not None}
+    return pa.table({schema.CANDIDATES: [*lists], ITEMS: [*lists.values()]})
 
 
 @contextmanager
@@ -59,11 +76,13 @@ def exposures_written(
     trained: TrainedPolicy,
     rule: str,
     decisions: Iterable[tuple[pd.DataFrame, IntArray]],
+    candidates: Array | None = None,
     *,
     excludes_seen: bool,
     at: str | float | None = None,
 ) -> Iterator[Iterator[pd.DataFrame]]:
-    """Yield the frames of `decide`, also written to a file, whole once the block ends.
+    """Yield the frames of `decide`, also written to a file, whole once the block ends; the ids that
+    were `candidates` are in a file beside it.
 
     Requests are a millisecond apart, from the time `at` on, or from now, so that a split by time
     can part them.
@@ -74,7 +93,9 @@ def exposures_written(
         schema.RULE: rule,
         schema.ARM: "",
         schema.EXCLUDES_SEEN: excludes_seen,
+        schema.CANDIDATES: name_set(candidates),
     }
+    write_sets(path, _tabulate_sets({name_set(candidates): candidates}))
 
     def write_all() -> Iterator[pd.DataFrame]:
         first = begin
@@ -122,7 +143,8 @@ class ExposureLog:
             raise InputError(f"{folder} cannot be written ({what}); name another folder") from None
         self._folder, self._schema = folder, exposure_schema(trained)
         self._rows, self._seconds, self._clock = rows, seconds, clock
-        self._waiting: list[tuple[str, int, Answer]] = []
+        self._waiting: list[tuple[str, int, str, Answer]] = []
+        self._sets: dict[str, Array | None] = {}
         self._count, self._lost = 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
@@ -131,11 +153,13 @@ class ExposureLog:
     def add(self, user_id: int | str, answer: "Answer") -> None:
         """Remember an answer that is given now; takes microseconds."""
         now, size = int(self._clock() * 1000), len(answer.items)
+        candidates = name_set(answer.candidates)
         with self._lock:
             if self._count > _MOST_WAITING * self._rows:
                 self._lost += size
                 return
-            self._waiting.append((str(user_id), now, answer))
+            self._waiting.append((str(user_id), now, candidates, answer._replace(candidates=None)))
+            self._sets[candidates] = answer.candidates
             self._count += size
             full = self._count >= self._rows
         if full:
@@ -164,10 +188,12 @@ class ExposureLog:
     def _flush(self, last: bool) -> None:
         with self._lock:
             waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
+            sets, self._sets = self._sets, {}
         if not count:
             return
         name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
         try:
+            write_sets(self._folder / name, _tabulate_sets(sets))
             with atomic_file(self._folder / name) as scratch:
                 pq.write_table(self._table(waiting), scratch)
         except (OSError, InputError, pa.ArrowException) as error:
@@ -176,23 +202,22 @@ class ExposureLog:
                     self._lost += count
                 else:
                     self._waiting, self._count = waiting + self._waiting, self._count + count
+                    self._sets = sets | self._sets
                 what = f"{error}; {self._count:,} rows wait, {self._lost:,} are lost"
             message = f"ucfrec: exposures: {self._folder / name} cannot be written: {what}"
             print(message, file=sys.stderr, flush=True)
             # A full log would otherwise try again at every answer.
             time.sleep(min(1.0, self._seconds))
 
-    def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
+    def _table(self, waiting: "list[tuple[str, int, str, Answer]]") -> pa.Table:
         rows = [
             (
-                *(user, item, now, answer.request_id, position, chance),
-                now if answer.session_began < 0 else answer.session_began,
-                *(answer.excludes_seen, answer.run, answer.rule, answer.arm),
+                *(user, item, now, a.request_id, position, chance),
+                now if a.session_began < 0 else a.session_began,
+                *(a.excludes_seen, a.run, a.rule, a.arm, candidates),
             )
-            for user, now, answer in waiting
-            for position, (item, chance) in enumerate(
-                zip(answer.items, answer.propensities, strict=True), 1
-            )
+            for user, now, candidates, a in waiting
+            for position, (item, chance) in enumerate(zip(a.items, a.propensities, strict=True), 1)
         ]
         frame = pd.DataFrame(rows, columns=self._schema.names)
         return pa.Table.from_pandas(frame, self._schema, preserve_index=False)

@@ -15,7 +15,7 @@ import numpy as np
 import xxhash
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.recommending.exposures import exposure_schema
@@ -53,6 +53,8 @@ class Answer(NamedTuple):
     """Time of the session's first row, ms; −1 for the time of the answer."""
     excludes_seen: bool = False
     """Whether items of the history could not be shown."""
+    candidates: Array | None = None
+    """Ids that it was chosen from, in any order; None for all items."""
 
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
@@ -229,6 +231,7 @@ class Responder:
             questions, counts, began.tolist(), *columns, strict=True
         ):
             items, logs, chances = (values[: min(count, question.k)] for values in lists)
+            numbers = question.candidates
             yield Answer(
                 items,
                 logs,
@@ -237,6 +240,7 @@ class Responder:
                 *self._source,
                 session_began=start,
                 excludes_seen=self._filter_seen,
+                candidates=None if numbers is None else self.trained.items.ids[numbers],
             )
 
 

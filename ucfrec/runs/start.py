@@ -163,7 +163,8 @@ def begin(
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
         rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
         write_json(scratch / RULE, rule.as_dict())
-        for name in (ITEM_STATES, OFFERS, ITEMS, USERS):
+        # Sets of candidates are those of the steps: requests have their own.
+        for name in (ITEM_STATES, ITEMS, USERS, *([OFFERS] if store.has_offers else [])):
             with suppress(FileNotFoundError):
                 shutil.copyfile(store.path / name, scratch / name)
         if store.has_items:

@@ -1,0 +1,119 @@
+"""Sets of candidates: what decisions of a log chose from, each distinct set once."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.arrays import IntArray
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file
+from ucfrec.logs.engine import bind, text_of_column, to_arrow
+from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
+from ucfrec.logs.tables import open_tables
+from ucfrec.logs.typed import KEY_OF_LIST, TypedLog
+
+ITEMS: Final = "items"
+"""Column of a table of sets: the ids in a set, whose name is in the column `candidates`."""
+
+_SETS = (
+    f"SELECT {schema.CANDIDATES}, CAST(any_value({ITEMS}) AS VARCHAR[]) AS {ITEMS} FROM "
+    f"(SELECT {{}} AS {schema.CANDIDATES}, {{}} AS {ITEMS} FROM {{}}) GROUP BY {schema.CANDIDATES}"
+)
+"""SQL of the sets in a relation, by the SQL of their names and of their lists."""
+
+
+def list_set_files(mapping: LogMapping, files: Sequence[Path]) -> list[Path]:
+    """Tables of sets that a mapping names, and those beside log files."""
+    stated = log_files(mapping.candidate_sets) if mapping.candidate_sets else ()
+    beside = (sets_beside(file) for file in files)
+    return list(dict.fromkeys([*stated, *(file for file in beside if file.is_file())]))
+
+
+def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | None:
+    """Number the sets of candidates of a log, after `number_ids`; None if no row has one.
+
+    Sets of the same known items are one. Those of `older`, as of `Offers.sets`, keep their numbers;
+    others follow, ordered by their items.
+
+    Returns (K + 1,) the set of each code of candidates, −1 for none and for a set without a
+    known item; and (2, C) all sets, as of `Offers.sets`. Raises InputError if a table of sets
+    cannot be used, or a row names a set that is in none.
+    """
+    connection = log.connection
+    if schema.CANDIDATES not in log.columns:
+        return None
+    (n_codes,) = log.one("SELECT count(*) FROM candidate_codes")
+    if not n_codes:
+        return None
+    connection.register("older_sets", pa.record_batch([*map(to_arrow, older)], ["number", "item"]))
+    connection.execute(f"CREATE TABLE named_sets AS {_select_sets(log)}")
+    unnamed, example = log.one(
+        f"SELECT count(*), min({schema.CANDIDATES}) FROM candidate_codes "
+        f"ANTI JOIN named_sets USING ({schema.CANDIDATES})"
+    )
+    if unnamed:
+        raise InputError(
+            f"{log.name}: {unnamed:,} sets that {schema.CANDIDATES} names (such as {example!r:.60})"
+            " are in no table; name the tables of sets in the mapping (candidate_sets), or ignore "
+            f"the column with --column {schema.CANDIDATES}="
+        )
+    n_older = int(older[0].max(initial=-1)) + 1
+    connection.execute(f"""
+        CREATE TABLE numbered_sets AS
+        WITH new AS (
+            SELECT code, list_sort(list(DISTINCT CAST(number AS BIGINT))) AS members
+            FROM (SELECT *, unnest({ITEMS}) AS id FROM named_sets)
+            JOIN candidate_codes USING ({schema.CANDIDATES})
+            JOIN items ON id = CAST({schema.ITEM_ID} AS VARCHAR) GROUP BY code
+        ),
+        old AS (SELECT number, list(item ORDER BY item) AS members FROM older_sets GROUP BY number)
+        SELECT code, members, coalesce(number, {n_older - 1} + dense_rank() OVER
+            (PARTITION BY number IS NULL ORDER BY members)) AS number
+        FROM new LEFT JOIN old USING (members)
+    """)
+    numbers = np.full(n_codes + 1, -1)
+    numbered = connection.sql("SELECT code, number FROM numbered_sets").fetchnumpy()
+    numbers[numbered["code"]] = numbered["number"]
+    added = connection.sql(
+        "SELECT number, unnest(any_value(members)) AS item FROM numbered_sets "
+        f"WHERE number >= {n_older} GROUP BY number ORDER BY number, item"
+    ).fetchnumpy()
+    return numbers, np.hstack([older, np.stack([added["number"], added["item"]])])
+
+
+def _select_sets(log: TypedLog) -> str:
+    """SQL of the sets that a log holds in lists or names: `candidates` as in its rows, `items`."""
+    connection, lists = log.connection, []
+    for table in log.tables:
+        text = text_of_column(connection, table, log.mapping, schema.CANDIDATES)
+        value = bind(connection, table, f"for {schema.CANDIDATES}", text)
+        if value.kind.endswith("[]"):
+            lists.append(_SETS.format(KEY_OF_LIST.format(value.sql), value.sql, table.sql))
+    files = [file for table in log.tables for file in table.files]
+    return select_named_sets(connection, list_set_files(log.mapping, files), lists)
+
+
+def select_named_sets(
+    connection: duckdb.DuckDBPyConnection, files: Sequence[Path], lists: Sequence[str] = ()
+) -> str:
+    """SQL of the sets in tables of sets and in `lists`, each once: `candidates`, the name as text,
+    and `items`, a list of text. Raises InputError if a table lacks these columns."""
+    every = [*lists, _SETS.format("CAST(NULL AS VARCHAR)", "CAST([] AS VARCHAR[])", "range(0)")]
+    for table in open_tables(connection, files) if files else ():
+        name, ids = (bind(connection, table, "of sets", n) for n in (schema.CANDIDATES, ITEMS))
+        every.append(_SETS.format(f"CAST({name.sql} AS VARCHAR)", ids.sql, table.sql))
+    rows = " UNION ALL ".join(every)
+    return f"SELECT {schema.CANDIDATES}, any_value({ITEMS}) AS {ITEMS} FROM ({rows}) GROUP BY ALL"
+
+
+def write_sets(log: Path, sets: pa.Table) -> None:
+    """Write the sets of candidates that a file names beside it; none without any."""
+    if sets.num_rows:
+        with atomic_file(sets_beside(log)) as scratch:
+            pq.write_table(sets, scratch)

@@ -43,15 +43,6 @@ def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
     assert any(text in reason for reason in report.verdict.reasons) == forbids
 
 
-def test_an_item_twice_on_a_page_is_said(
-    log: pd.DataFrame, trained: TrainedPolicy, read: Read
-) -> None:
-    log, pages = log.drop_duplicates("user_id"), EstimateOptions(pages=True)
-    with read(pd.concat([log, log.iloc[:3]]), keep=True) as logged:
-        report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
-    assert any("3 rows repeat the user, item and time" in each for each in report.warnings)
-
-
 def test_steps_with_a_propensity_are_estimated_where_sessions_cannot_be(
     folder: Path, log: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -108,12 +108,12 @@ def test_clicks_on_what_the_old_run_showed_do_not_speak_for_it(
     shares /= shares.sum()
     items = np.random.default_rng(0).choice(LOGGED_ITEMS, p=shares, size=6000)
     rows = logged(tmp_path, items, shares[items], (0.1, 0.1, 0.8)).split("test")
-    found = compare_runs(trained, reversed_of(trained), rows, 0).differences
+    found = compare_runs(trained, reversed_of(trained), newest(rows), 0).differences
     assert found["ndcg_liked"].standing() == "better"
     steps = {name: rows.column(name) for name in ("item", "reward", "timestamp")}
     episodes = {n: rows.episode_values(n) for n in ("user", "terminated")}
     blind = EpisodeStore.from_arrays(steps, rows.lengths, episodes, trained.item_states)
-    found = compare_runs(trained, reversed_of(trained), blind, 0).differences
+    found = compare_runs(trained, reversed_of(trained), newest(blind), 0).differences
     assert found["ndcg_liked"].standing() == "worse"
 
 

@@ -373,12 +373,12 @@ def note_undefined(
 def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMapping) -> None:
     """Warn of many equal times, of one item only, and of sessions as long as those of bots."""
     user = mapping.columns.get(schema.USER_ID, schema.USER_ID)
-    if rows.tied > MANY * rows.count:
+    if rows.tied > MANY * rows.count and schema.POSITION not in rows.log.columns:
         _note(
             rows,
             f"{rows.tied / rows.count:.0%} of the rows share their time with another row of "
-            "the user, so their order is unknown and is not learned; log finer times, or add the "
-            "place on a page",
+            "the user: they count as one list, whose order is unknown and is not learned; log finer "
+            "times, or columns request_id and position",
         )
     if report.get("items") == 1:
         _note(

@@ -313,8 +313,9 @@ def _write(
 
     typed = log.rows.log
     left = [shard for shard in shards if shard.stays.any()]
-    present = {*typed.columns} - ({schema.CANDIDATES} if log.sets is None else set())
-    added = [name for name in _FILL if name in present and name not in old.columns]
+    added = [name for name in _FILL if name in typed.columns and name not in old.columns]
+    if log.sets is None and schema.CANDIDATES in added:
+        added.remove(schema.CANDIDATES)
     if schema.OBSERVATION in old.columns and schema.OBSERVATION not in typed.columns:
         raise InputError(
             f"{typed.name} has no observation, {store} has; name its column with --column"

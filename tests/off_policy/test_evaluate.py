@@ -12,7 +12,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.off_policy.answer import conclude, cut_to_steps
 from ucfrec.off_policy.estimators import estimate
-from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
+from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -12,8 +12,8 @@ import pytest
 
 from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
-from ucfrec.off_policy import LoggedSteps, Modelled, as_pages, conclude, diagnose, estimate
-from ucfrec.off_policy.logged_steps import ItemGroups, number_pages
+from ucfrec.off_policy import LoggedSteps, Modelled, conclude, diagnose, estimate, merge_lists
+from ucfrec.off_policy.logged_steps import ItemGroups
 
 LENGTHS = [2, 1, 3] * 20
 STEPS = random_steps(LENGTHS)
@@ -120,77 +120,49 @@ def test_what_cannot_be_read_is_one_clear_error(change: dict[str, Any], says: st
 
 
 SLATE = Path(__file__).with_name("fixtures") / "slate.npz"
-BY_MODEL = {"independent": "IIPS", "cascade": "PDIS", "slate": "IPS"}
+BY_MODEL = {"independent": "IIPS", "cascade": "PDIS", "whole list": "IPS"}
+"""How positions influence each other, and what the Open Bandit Pipeline calls the estimate."""
+
+
+def estimate_lists(steps: LoggedSteps, positions: str) -> float:
+    """PDIS of lists under an assumption."""
+    as_assumed = (
+        merge_lists(steps) if positions == "whole list" else replace(steps, positions=positions)
+    )
+    return estimate(as_assumed, seed=0)["PDIS"].value
 
 
 def test_estimates_agree_with_the_open_bandit_pipeline() -> None:
     with np.load(SLATE) as given:
-        steps = LoggedSteps(
-            np.arange(len(given["page"])), given["reward"], given["propensity"], given["target"]
-        )
-        found = estimate(as_pages(steps, given["page"]), seed=0)
-        for name in BY_MODEL.values():
-            assert found[name].value == pytest.approx(float(given[name]), rel=1e-9), name
+        order = np.argsort(given["page"], kind="stable")
+        page = np.unique(given["page"][order], return_inverse=True)[1]
+        place = np.arange(len(page)) - np.searchsorted(page, page)
+        columns = (given[name][order] for name in ("reward", "propensity", "target"))
+        steps = LoggedSteps(page, *columns, place=place)
+        for positions, name in BY_MODEL.items():
+            expected = pytest.approx(float(given[name]), rel=1e-9)
+            assert estimate_lists(steps, positions) == expected, name
 
 
 @pytest.mark.parametrize("model", BY_MODEL)
 def test_each_estimate_is_right_where_its_model_is(model: str) -> None:
     """Exactly, over every page of three positions and two items; the weaker model errs."""
     behavior, target = np.array([0.7, 0.3]), np.array([0.2, 0.8])
-    values = dict.fromkeys(("IIPS", "PDIS", "IPS"), 0.0)
+    values = dict.fromkeys(BY_MODEL, 0.0)
     truth = 0.0
     for page in itertools.product((0, 1), repeat=3):
         items = np.array(page)
         seen = {
             "independent": items,
             "cascade": items.cumsum(),
-            "slate": items.sum() * np.arange(1, 4),
+            "whole list": items.sum() * np.arange(1, 4),
         }
         reward = np.asarray(seen[model], dtype=np.float64) ** 2
-        steps = LoggedSteps(np.arange(3), reward, behavior[items], target[items])
-        found = estimate(as_pages(steps, np.zeros(3, dtype=np.int64)), seed=0)
+        chances = behavior[items], target[items]
+        steps = LoggedSteps(np.zeros(3, dtype=int), reward, *chances, place=np.arange(3))
         truth += target[items].prod() * reward.sum()
-        for name in values:
-            values[name] += behavior[items].prod() * found[name].value
+        for positions in values:
+            values[positions] += behavior[items].prod() * estimate_lists(steps, positions)
     right = list(BY_MODEL).index(model)
-    for place, name in enumerate(BY_MODEL.values()):
-        assert (abs(values[name] - truth) < 1e-12) == (place >= right), name
-
-
-def test_steps_of_a_page_lie_anywhere_and_keep_their_order() -> None:
-    steps = replace(random_steps([1] * 6), user=np.array([5, 7, 5, 7, 5, 7]))
-    pages = as_pages(steps, np.array([30, 10, 30, 10, 30, 20]))
-    np.testing.assert_array_equal(pages.session, [0, 0, 1, 2, 2, 2])
-    np.testing.assert_array_equal(pages.reward, steps.reward[[1, 3, 5, 0, 2, 4]])
-    np.testing.assert_array_equal(pages.user, [7, 7, 5])
-    np.testing.assert_array_equal(pages.model.q, steps.model.q[[1, 3, 5, 0, 2, 4]])
-    pages = as_pages(steps, np.array([0, 1, 0, 1, 0, 1]), np.array([2, 0, 0, 1, 1, 2]))
-    np.testing.assert_array_equal(pages.reward, steps.reward[[2, 4, 0, 1, 3, 5]])
-    # Rows of one user within ten milliseconds are a page.
-    user = np.array([3, 8, 3, 3, 8, 3])
-    time = np.array([1000, 1003, 1009, 1018, 1014, 1029])
-    np.testing.assert_array_equal(number_pages(user, time), [0, 2, 0, 0, 3, 1])
-
-
-def test_normalised_weights_ignore_the_scale_of_a_position() -> None:
-    page, position = np.repeat(np.arange(200), 3), np.tile(np.arange(3), 200)
-    pages = as_pages(random_steps([1] * 600), page)
-    scaled = replace(pages, propensity=pages.propensity * np.array([1, 0.5, 0.1])[position])
-    one, other = estimate(pages, 0), estimate(scaled, 0)
-    assert {"DM", "DR", "IIPS"} <= set(one)
-    assert "FQE" not in one  # its Q is of one position
-    assert conclude(pages, 0).estimator == "DR"
-    assert other["SNIIPS"].value == pytest.approx(one["SNIIPS"].value)
-    assert other["IIPS"].value != pytest.approx(one["IIPS"].value)
-    ratios = pages.target / pages.propensity
-    expected = sum(
-        (ratios * pages.reward)[position == t].sum() / ratios[position == t].sum() for t in range(3)
-    )
-    assert one["SNIIPS"].value == pytest.approx(expected)
-
-
-def test_sessions_of_several_steps_are_no_positions() -> None:
-    with pytest.raises(InputError, match=r"only 2 sessions for 4 steps: .* one session a row"):
-        as_pages(random_steps([2, 2]), np.zeros(4, dtype=np.int64))
-    with pytest.raises(InputError, match=r"page has shape \(2,\)"):
-        as_pages(random_steps([1] * 3), np.zeros(2, dtype=np.int64))
+    for place, positions in enumerate(BY_MODEL):
+        assert (abs(values[positions] - truth) < 1e-12) == (place >= right), positions

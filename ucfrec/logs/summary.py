@@ -377,8 +377,8 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
         _note(
             rows,
             f"{rows.tied / rows.count:.0%} of the rows share their time with another row of "
-            "the user: they count as one list, whose order is unknown and is not learned; log finer "
-            "times, or columns request_id and position",
+            "the user: they count as one list, whose order is unknown and is not learned; log "
+            "finer times, or columns request_id and position",
         )
     if report.get("items") == 1:
         _note(

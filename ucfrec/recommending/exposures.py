@@ -151,7 +151,8 @@ class ExposureLog:
         self._thread.start()
 
     def add(self, user_id: int | str, answer: "Answer") -> None:
-        """Remember an answer that is given now; takes microseconds."""
+        """Remember an answer that is given now; takes microseconds, or a fifth of a millisecond for
+        a thousand candidates."""
         now, size = int(self._clock() * 1000), len(answer.items)
         candidates = name_set(answer.candidates)
         with self._lock:

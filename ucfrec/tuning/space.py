@@ -71,23 +71,6 @@ NEIGHBORS: Final[Space] = {"policy.neighbors": Dimension(low=10, high=500, log=T
 REWARD_WEIGHTS: Final[Space] = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0))}
 
 
-def default_space(policy: str, by_value: bool) -> Space:
-    """The settings that matter for a policy.
-
-    Args:
-        by_value: whether trials are measured by the estimated value. The training then searches
-            the reward weight itself in every trial, so it is not a setting of the search.
-    """
-    policy_type = policy_class(policy)
-    space: Space = {} if by_value else REWARD_WEIGHTS
-    if policy_type.make_solver is SequencePolicy.make_solver:
-        reads = policy_type.Config().context > 1
-        space = {**NETWORK, **(HISTORY if reads else {}), **space}
-    if hasattr(policy_type.Config(), "neighbors"):
-        space = {**NEIGHBORS, **space}
-    return space
-
-
 def read_space(path: Path) -> Space:
     """Read a TOML file with the tables of a configuration, whose fields are lists of choices or
     ranges `{low = …, high = …, log = true}`.
@@ -134,7 +117,14 @@ class Search:
 
     def space(self, policy: str) -> Space:
         """The settings that vary: those of the space that are not fixed."""
-        space = default_space(policy, self.by_value) if self.own_space is None else self.own_space
+        space, kind = self.own_space, policy_class(policy)
+        if space is None:
+            # By the estimated value, every training searches the reward weight itself.
+            space = {} if self.by_value else REWARD_WEIGHTS
+            if kind.make_solver is SequencePolicy.make_solver:
+                space = {**NETWORK, **(HISTORY if kind.Config().context > 1 else {}), **space}
+            if hasattr(kind.Config(), "neighbors"):
+                space = {**NEIGHBORS, **space}
         return {name: values for name, values in space.items() if name not in self.fixed}
 
     def config(self, policy: str, values: Mapping[str, Value]) -> Config:

@@ -36,11 +36,9 @@ from ucfrec.counterfactual.generators import (
     make_generator,
     state_clusters,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
-from ucfrec.episodes.states import ItemStates
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
-from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 ALGORITHM_5 = AugmentConfig(copies=4, edits_per_copy=1, reward_quantile=0.0)
 APPENDIX_H = AugmentConfig(copies=2, edits_per_copy=0, reward_quantile=0.3)
@@ -310,52 +308,3 @@ def test_actions_alone_need_no_generator(tmp_path: Path) -> None:
     assert report.actions.copies == len(copies.action_source) > 0
     logged = planted_store().step_values(schema.REWARD, copies.action_source, copies.action_step)
     assert logged.min() >= np.quantile(logged_rewards(), 0.5)
-
-
-def item_store() -> EpisodeStore:
-    """Sessions of ten items, of which clicks depend on item and user, and some on what came."""
-    rng = np.random.default_rng(0)
-    sessions, length, items = 80, 6, 10
-    shown = rng.integers(items, size=(sessions, length))
-    user = rng.integers(8, size=sessions)
-    chance = 1 / (1 + np.exp(-np.linspace(-2, 2, items)[shown] - 0.3 * (user - 4)[:, None]))
-    columns = {
-        schema.ITEM: shown.ravel(),
-        schema.REWARD: (rng.random(shown.shape) < chance).ravel(),
-    }
-    per_session = {schema.USER: user, schema.SPLIT: np.arange(sessions) % 5 == 0}
-    embeddings = torch.randn(items, 3, generator=torch.Generator().manual_seed(0))
-    states = ItemStates(embeddings, torch.zeros(8, 0), 0.0, 1.0)
-    return EpisodeStore.from_arrays(columns, np.full(sessions, length), per_session, states)
-
-
-def with_other_items(store: EpisodeStore, copies: AugmentedEpisodes, copy: int) -> EpisodeStore:
-    """The store as if the log had shown the item of an action copy."""
-    at = store.all_steps()
-    items = store.step_values(schema.ITEM, *at)
-    here = (at[0] == copies.action_source[copy]) & (at[1] == copies.action_step[copy])
-    items[here] = copies.action[copy]
-    columns = {schema.ITEM: items, schema.REWARD: store.step_values(schema.REWARD, *at)}
-    per_session = {name: store.episode_values(name) for name in (schema.USER, schema.SPLIT)}
-    return EpisodeStore.from_arrays(columns, store.lengths, per_session, store.item_states)
-
-
-def test_additive_effects_read_the_other_item_where_it_would_be_shown(tmp_path: Path) -> None:
-    store = item_store()
-    train, validation = store.split("train"), store.split("validation")
-    config = AugmentConfig(copies=0, actions=2, epsilon_r=10.0)
-    crm = CRMConfig(mean="effects", epochs=1, hidden=16)
-    copies, report = augment_episodes(train, validation, crm, CSGConfig(), config, tmp_path, seed=0)
-    assert report.actions is not None
-    assert report.actions.copies > 20
-    assert copies.action_reward.min() >= 0
-    assert copies.action_reward.max() <= 1
-    model, _ = fit_item_reward_model(train, validation, tmp_path / "item-reward", 0)
-    positions = np.searchsorted(train.episode_ids, copies.action_source[:5])
-    copied = read_transitions(train, positions, copies.action_step[:5], model, copies.action[:5])
-    for copy in range(5):
-        episode, step = copies.action_source[[copy]], copies.action_step[[copy]]
-        shown = read_transitions(with_other_items(store, copies, copy), episode, step, model)
-        torch.testing.assert_close(copied.actions[copy], shown.actions[0])
-        # What was not known before the step is not in its state.
-        assert torch.equal(shown.states, store.transitions(episode, step).states)

@@ -30,7 +30,6 @@ from ucfrec import schema
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, Sessions, TrainingEpisodes
-from ucfrec.errors import InputError
 
 USERS = 3
 
@@ -70,8 +69,7 @@ def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
 
 
 definitions = st.sampled_from(
-    [ReturnToGo(), *(ReturnToGo("discounted", gamma) for gamma in (0.25, 0.5, 1.0))]
-    + [ReturnToGo("horizon", horizon=steps) for steps in range(1, 6)]
+    [ReturnToGo(), *(ReturnToGo("horizon", steps) for steps in range(1, 6))]
 )
 
 
@@ -80,10 +78,6 @@ def make_store(
 ) -> EpisodeStore:
     states, episodes = some_states() if items else None, random_episodes([*lengths], items=items)
     return write_store(Path(folder) / "store", episodes, states, shard_steps=6)
-
-
-def both_kinds(store: EpisodeStore) -> AugmentedEpisodes:
-    return random_edits(store, 4, seed=1)[0].join(random_action_copies(store, 3, seed=5))
 
 
 @given(
@@ -208,37 +202,7 @@ def test_what_is_saved_is_read(tmp_path: Path, copies: int) -> None:
     store = make_store(tmp_path)
     augmented = random_edits(store, copies, seed=5)[0].join(random_action_copies(store, copies, 6))
     augmented.save(tmp_path / "augmented.safetensors")
-    read = AugmentedEpisodes.load(tmp_path / "augmented.safetensors", store.split("train"))
+    read = AugmentedEpisodes.load(tmp_path / "augmented.safetensors")
     for name, values in vars(augmented).items():
         assert getattr(read, name).dtype == values.dtype
         assert np.array_equal(getattr(read, name), values)
-
-
-def test_a_forged_file_or_one_of_another_store_is_refused(tmp_path: Path) -> None:
-    stores = [make_store(tmp_path), make_store(tmp_path / "vectors", items=False)]
-    good, vectors = (both_kinds(store) for store in stores)
-    changes: list[dict[str, np.ndarray]] = [
-        {"copy_source": good.copy_source + len(LENGTHS)},
-        {"action_source": good.action_source + len(LENGTHS)},
-        {"edit_step": good.edit_step + 9},
-        {"action_step": good.action_step - 9},
-        {"edit_state": good.edit_state[:, :1]},
-        {"edit_state": good.edit_state.astype(np.float64)},
-        {"action": good.action + 11},
-        {"action": np.zeros((3, 3), dtype=np.float32)},
-        {"edit_copy": good.edit_copy[::-1].copy()},
-        {"edit_step": good.edit_step[np.lexsort((-good.edit_step, good.edit_copy))]},
-        {"edit_copy": good.edit_copy + len(good.copy_source)},
-    ]
-    for name, values in vars(good).items():
-        changes += [{name: values[..., None]}] if values.ndim == 1 else []
-        changes += [{name: values[1:].copy()}] if name != "copy_source" else []
-        changes += [{name: values.astype(np.float64)}] if values.dtype == np.int64 else []
-    forged = [(stores[0], replace(good, **change)) for change in changes]
-    wrong_vectors = (vectors.action[:, :1].copy(), np.zeros(3, dtype=np.int64))
-    forged += [(stores[1], replace(vectors, action=action)) for action in wrong_vectors]
-    path = tmp_path / "augmented.safetensors"
-    for store, augmented in forged:
-        augmented.save(path)
-        with pytest.raises(InputError, match=r"augmented\.safetensors is damaged .* train again"):
-            AugmentedEpisodes.load(path, store)

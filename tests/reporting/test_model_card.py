@@ -19,7 +19,7 @@ RECORD: dict[str, Any] = {
     "return_quantiles": {"0.5": 1.0, "1.0": 9.0},
     "sizes": {"items": 80, "state": 9, "action": 8, "users": 33, "tags": 0},
     "observation_size": 0,
-    "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
+    "return_to_go": {"definition": "session", "horizon": 1},
     "versions": {"ucfrec": "0.1.0"}, "reference_losses": {"uniform": 4.4, "popularity": 3.6},
     "policy": {"steps": 300, "best_step": 200, "best_validation": 3.5, "seconds": 8.0},
     "data": {

@@ -65,7 +65,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_left_alone(store: Path, left_alon
 def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> None:
     trained = TrainedPolicy.load(left_alone)
     view = EpisodeStore.open(store).split("train")
-    augmented = AugmentedEpisodes.load(left_alone / "augmented.safetensors", view)
+    augmented = AugmentedEpisodes.load(left_alone / "augmented.safetensors")
     assert {*augmented.copy_source, *augmented.action_source} <= {*view.episode_ids}
     assert len(augmented.edit_step) > 0
     report = trained.record.augmentation
@@ -107,7 +107,7 @@ def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> No
 def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: Path) -> None:
     whole = vectors(tmp_path / "store")
     train_run(whole, tmp_path / "run", resolve_config("ucf", None, [*SHORT, "augment.copies=1"]))
-    augmented = AugmentedEpisodes.load(tmp_path / "run" / "augmented.safetensors", whole)
+    augmented = AugmentedEpisodes.load(tmp_path / "run" / "augmented.safetensors")
     assert not set(augmented.copy_source) & {1, 11, 21, 31, 41, 51}
     columns = {"observation": np.zeros((5, 1)), "action": np.zeros((5, 1)), "reward": np.zeros(5)}
     single = EpisodeStore.write(tmp_path / "single", columns, np.array([5]))

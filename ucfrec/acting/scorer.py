@@ -22,7 +22,7 @@ from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows, seen_before
+from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows, pad_columns, seen_before
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
@@ -486,7 +486,7 @@ class _ItemProduct:
 
     def pad_items(self, recent: Shown) -> Tensor:
         """(B, N) the items that repetition and likeness refer to."""
-        return _pad(recent.items, self._columns, -1)
+        return pad_columns(recent.items, self._columns, -1)
 
     def policy_part(self, windows: Windows, recent: Shown) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from windows with their target returns."""
@@ -495,13 +495,11 @@ class _ItemProduct:
         features = self._features(normalized)
         repeated = alike = features.new_zeros(features.shape[0], self._columns)
         if self._exposure is not None:
-            exposed = Exposed(
-                _pad(recent.items, self.lags, -1).to(device),
-                _pad(recent.rewards, self.lags, 0).to(device),
-                normalized.returns_to_go[:, -1],
-            )
+            items, rewards = (values.to(device) for values in recent.padded(self.lags))
+            exposed = Exposed(items, rewards, normalized.returns_to_go[:, -1])
             repeated, alike = (
-                _pad(weights, self._columns, 0) for weights in self._exposure.weights(exposed)
+                pad_columns(weights, self._columns, 0)
+                for weights in self._exposure.weights(exposed)
             )
         part = Part(features / features.shape[-1] ** 0.5, repeated, alike)
         return features.cpu(), Part._make(values.cpu() for values in part)
@@ -513,7 +511,9 @@ class _ItemProduct:
         query = model.query(states, sessions.users, model.tastes_after(recent))
         _, repeated, alike = model.exposures(recent)
         factors = F.pad(query, (0, 1), value=1.0)
-        return Part(factors, _pad(repeated, self._columns, 0), _pad(alike, self._columns, 0))
+        return Part(
+            factors, pad_columns(repeated, self._columns, 0), pad_columns(alike, self._columns, 0)
+        )
 
     def _counts_shown(self, policy: bool, rewards: bool) -> bool:
         """Whether what was shown counts."""
@@ -606,13 +606,6 @@ class _ItemProduct:
         last = of_likeness if self._counts_shown(policy, rewards) else of_policy
         rows = matrix[0 if policy else of_policy : len(matrix) if rewards else last]
         return rows, bias if policy else torch.zeros(())
-
-
-def _pad(values: Tensor, length: int, padding: int) -> Tensor:
-    """The first `length` columns of values (B, N), with more columns where there are fewer."""
-    missing = max(0, length - values.shape[1])
-    values = values[:, :length]
-    return F.pad(values, (0, missing), value=padding) if missing else values
 
 
 def sessions_before(

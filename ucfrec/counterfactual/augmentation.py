@@ -28,10 +28,8 @@ from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
     CRMReport,
-    EffectsMean,
     fit_crm,
     fit_warning,
-    read_transitions,
     sample_steps,
 )
 from ucfrec.episodes.store import EpisodeStore
@@ -40,12 +38,10 @@ from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.processes import random_state_kept
 from ucfrec.settings import Count, Quantile, settings_table
-from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 CRM: Final = "crm"
 """Folder of the reward model."""
-MODELS: Final = ("item-reward", CRM, "csg")
+MODELS: Final = (CRM, "csg")
 """Folders of the checkpoints of `augment_episodes`, as far as the settings need them."""
 _CPU = torch.device("cpu")
 _CHUNK, _ACTION_CHUNK = 8192, 4096
@@ -179,15 +175,11 @@ def augment_episodes(
     """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1) of the episodes
     of `train`; those of `validation` stop the fit early. Training resumes from `folder`."""
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
-    item_rewards = mean = None
-    if crm_config.mean == "effects" and train.has_items:
-        item_rewards, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
-        mean = EffectsMean(item_rewards)
     sampled_episodes, sampled_steps = sample_steps(train, limit, seed)
-    training = read_transitions(train, sampled_episodes, sampled_steps, item_rewards)
+    training = train.transitions(sampled_episodes, sampled_steps)
     held_out_episodes, held_out_steps = sample_steps(validation, limit // 10, seed)
-    held_out = read_transitions(validation, held_out_episodes, held_out_steps, item_rewards)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
+    held_out = validation.transitions(held_out_episodes, held_out_steps)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
         csg_config = replace(csg_config, kind="noise")
@@ -195,15 +187,13 @@ def augment_episodes(
     if config.actions or csg_config.kind == "tangent":
         clusters = state_clusters(training, crm, csg_config, seed)
     generator = make_generator(training, crm, csg_config, folder / "csg", seed, clusters)
-    episodes, report = edit_states(train, crm, crm_report, generator, config, seed, item_rewards)
+    episodes, report = edit_states(train, crm, crm_report, generator, config, seed)
     if clusters is None or not config.actions:
         return episodes, report
     states = crm.normalise_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
     support = ActionSupport(labels, read_actions(train, sampled_episodes, sampled_steps))
-    actions = ActionGenerator(
-        train, crm, clusters, support, report.epsilon_r, report.delta, item_rewards
-    )
+    actions = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta)
     copied, steps = find_candidates(train, config, np.random.default_rng(seed))
     copies, actions_report = actions.propose(copied, steps, config.actions, seed)
     return episodes.join(copies), replace(report, actions=actions_report)
@@ -240,10 +230,8 @@ def edit_states(
     generator: Generator,
     config: AugmentConfig,
     seed: int,
-    item_rewards: ItemRewardModel | None = None,
 ) -> tuple[AugmentedEpisodes, AugmentationReport]:
-    """Copy training episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`);
-    `item_rewards` is that of `read_transitions`."""
+    """Copy training episodes with other states (Algorithm 5, or appendix H: `AugmentConfig`)."""
     rng, random = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     # The gates are evaluated in float64 on the stored float32 values, so that a later check of the
     # edits confirms every one.
@@ -258,8 +246,7 @@ def edit_states(
         states = [np.zeros((0, view.state_size), np.float32)]
         for start in range(0, len(steps), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            factual = read_transitions(view, episodes[rows], steps[rows], item_rewards)
-            factual = factual.to(crm.device)
+            factual = view.transitions(episodes[rows], steps[rows]).to(crm.device)
             s, a, r = factual.states, factual.actions, factual.rewards
             proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
@@ -439,8 +426,6 @@ class ActionGenerator:
     support: ActionSupport
     epsilon_r: float
     delta: float
-    item_rewards: ItemRewardModel | None = None
-    """See `read_transitions`."""
 
     def propose(
         self,
@@ -461,7 +446,7 @@ class ActionGenerator:
             whether the model reproduces the logged reward."""
             drawn_at = np.arange(start, min(start + _ACTION_CHUNK, len(steps)))
             at = episodes[drawn_at], steps[drawn_at]
-            factual = read_transitions(view, at[0], at[1], self.item_rewards).to(self.crm.device)
+            factual = view.transitions(at[0], at[1]).to(self.crm.device)
             s, a, r = (v.double() for v in (factual.states, factual.actions, factual.rewards))
             z = exact.abduct(s, a, r)
             error = (exact.predict(s, a, z) - r).abs()
@@ -472,9 +457,7 @@ class ActionGenerator:
             logged = read_actions(view, at[0][rows], at[1][rows])
             differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
             rows, actions = rows[differs], actions[differs]
-            changed = read_transitions(
-                view, at[0][rows], at[1][rows], self.item_rewards, actions
-            ).actions
+            changed = view.action_vectors(torch.from_numpy(actions))
             predicted = exact.predict(s[rows], changed.to(s), z[rows]).cpu().numpy()
             return drawn_at[rows], actions, predicted, reproduced[rows]
 

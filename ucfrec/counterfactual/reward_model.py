@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.files.record import Undefinable
@@ -26,11 +26,8 @@ from ucfrec.settings import (
     Weight,
     WeightDecay,
     Width,
-    require,
     settings_table,
 )
-from ucfrec.user_model.reward import CLIP, ItemRewardModel
-from ucfrec.user_model.reward_report import RewardRows
 
 _LOG_2PI = math.log(2 * math.pi)
 INITIAL: Final = "initial.safetensors"
@@ -77,9 +74,6 @@ class CRMConfig:
     β × decoder_std² of the reward's variance is not abduced; the default is that of the gate."""
     mean_first: bool = True
     """Fit E[r | s, a] by regression, freeze it, then train the CVAE on top; false: Eq. 2 alone."""
-    mean: Literal["network", "effects"] = "network"
-    """What E[r | s, a] is: a `network` of state and action; or, where actions are items, additive
-    `effects` of item, user, what was shown before and the state."""
     learning_rate: LearningRate = 4e-3
     """Highest learning rate of the CVAE, half of which is the regression's; it falls to 0 along a
     cosine."""
@@ -96,11 +90,6 @@ class CRMConfig:
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
     """Maximum number of transitions to train on; from more, a random sample is drawn."""
 
-    def __post_init__(self) -> None:
-        """Check the fields against each other."""
-        fault = f"crm.mean is {self.mean!r}, which needs crm.mean_first=true"
-        require(self.mean_first or self.mean == "network", fault, "crm.mean", "crm.mean_first")
-
 
 class Posterior(NamedTuple):
     """Diagonal Gaussian q(z | s, a, r); both fields (..., latent_dim)."""
@@ -114,51 +103,16 @@ class Posterior(NamedTuple):
         return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance)
 
 
-class EffectsMean(nn.Module):
-    """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states and of actions of
-    `read_transitions`: the item's vector, then the part of the predictor that no state changes."""
-
-    def __init__(self, model: ItemRewardModel) -> None:
-        super().__init__()
-        self.binary = bool(model.binary)
-        self.state_mean = nn.Buffer(model.state_mean.clone())
-        self.state_std = nn.Buffer(model.state_std.clone())
-        self.state = nn.Buffer(model.state.clone())
-        self.interaction = nn.Buffer(model.interaction.clone())
-        ends = (model.reward_low, model.reward_high - model.reward_low)
-        units = ends if self.binary else (model.reward_mean, model.reward_std)
-        self.reward = nn.Buffer(torch.stack(units))
-
-    def forward(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Expected rewards (...), in reward units, of states (..., S) and actions (..., D + 1)."""
-        x = ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
-        vectors, fixed = actions[..., :-1], actions[..., -1]
-        scores = fixed + x @ self.state + ((x @ self.interaction) * vectors).sum(-1)
-        start, unit = self.reward
-        rewards: Tensor = start + unit * (torch.sigmoid(scores) if self.binary else scores)
-        return rewards
-
-
 class CausalRewardModel(nn.Module):
     """Conditional variational autoencoder of the reward (paper Eq. 2, Algorithm 2), of states
     (..., S), actions (..., A) and rewards (...) in original units. The decoder is E[r | s, a], or
     without `mean_first` 0, plus a term of z; the encoder's input is r − E[r | s, a]."""
 
-    expected: nn.Sequential | EffectsMean
-
-    def __init__(
-        self,
-        state_size: int,
-        action_size: int,
-        config: CRMConfig,
-        mean: EffectsMean | None = None,
-    ) -> None:
-        """`mean` is E[r | s, a], whose actions have the size A = `action_size`; None for a network
-        that is yet to be trained."""
+    def __init__(self, state_size: int, action_size: int, config: CRMConfig) -> None:
         super().__init__()
         self.config = config
         input_size = state_size + action_size
-        self.expected = mean or mlp(input_size, config.hidden, 2, 1)
+        self.expected = mlp(input_size, config.hidden, 2, 1)
         self.encoder = mlp(input_size + 1, config.hidden, 2, 2 * config.latent_dim)
         self.decoder = mlp(input_size + config.latent_dim, config.hidden, 2, 1)
         self.state_mean = nn.Buffer(torch.zeros(state_size))
@@ -228,18 +182,12 @@ class CausalRewardModel(nn.Module):
     def _disturbance(self, inputs: Tensor, z: Tensor) -> Tensor:
         """What z adds to the expected reward, in its standard deviations, (...)."""
         disturbance: Tensor = self.decoder(torch.cat([inputs, z], dim=-1)).squeeze(-1)
-        if isinstance(self.expected, EffectsMean):
-            # With z at its prior mean, the model predicts exactly E[r | s, a].
-            without = torch.cat([inputs, torch.zeros_like(z)], dim=-1)
-            disturbance = disturbance - self.decoder(without).squeeze(-1)
         return disturbance
 
     def predict_expected(self, states: Tensor, actions: Tensor) -> Tensor:
         """E[r | s, a], standardised as rewards are, (...); 0 without `mean_first`."""
         if not self.config.mean_first:
             return states.new_zeros(states.shape[:-1])
-        if isinstance(self.expected, EffectsMean):
-            return self.normalise_rewards(self.expected(states, actions))
         expected: Tensor = self.expected(self.given(states, actions)).squeeze(-1)
         return expected
 
@@ -279,29 +227,6 @@ def _normalise(values: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     return (values - mean) / torch.where(std > 0, std, 1.0)
 
 
-@torch.no_grad()
-def read_transitions(
-    view: EpisodeStore,
-    episodes: IntArray,
-    steps: IntArray,
-    item_rewards: ItemRewardModel | None = None,
-    actions: Array | None = None,
-) -> Transitions:
-    """Single steps of a view with the actions (M, A) that the reward model is fitted to; with
-    `item_rewards`, those that `EffectsMean` reads (M, D + 1). Given `actions`, (M,) items or (M, A)
-    vectors, replace the logged ones."""
-    transitions = view.transitions(episodes, steps)
-    if item_rewards is None:
-        if actions is None:
-            return transitions
-        return replace(transitions, actions=view.action_vectors(torch.from_numpy(actions)))
-    rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
-    items = rows.items if actions is None else torch.from_numpy(actions)
-    fixed = item_rewards.score_without_state(rows.history, rows.users, items)
-    fixed = fixed + item_rewards.sum_running(rows.offer, items)
-    return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
-
-
 @dataclass(frozen=True)
 class CRMReport:
     """Quality of the reward model, measured on held-out steps."""
@@ -336,7 +261,6 @@ def fit_crm(
     config: CRMConfig,
     folder: Path,
     seed: int,
-    mean: EffectsMean | None = None,
     device: torch.device = _CPU,
 ) -> tuple[CausalRewardModel, CRMReport]:
     """Train the reward model (Algorithm 2) with early stopping on held-out steps; the model with
@@ -344,7 +268,6 @@ def fit_crm(
 
     Args:
         folder: of the checkpoints, which training resumes from, and perhaps of `INITIAL`.
-        mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
     """
     rng = np.random.default_rng(seed)
@@ -353,7 +276,7 @@ def fit_crm(
         for steps, limit in ((train, config.max_transitions), (validation, _VALIDATION_LIMIT))
     )
     torch.manual_seed(seed)
-    model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
+    model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config)
     model = model.to(device)
     for name in ("state", "action", "reward"):
         values = getattr(train, f"{name}s").double()
@@ -362,9 +285,9 @@ def fit_crm(
         std = torch.where(std > _CONSTANT * average.abs().clamp(min=1.0), std, 0.0)
         model.get_buffer(f"{name}_mean").copy_(average)
         model.get_buffer(f"{name}_std").copy_(std)
-    if mean is None and (folder / INITIAL).exists():
+    if (folder / INITIAL).exists():
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
-    if config.mean_first and mean is None:
+    if config.mean_first:
         _fit_mean(model, train, held_out, folder / "mean", seed)
     rows, (inputs, residual) = (_read_inputs(model, steps) for steps in (train, held_out))
     if config.mean_first:

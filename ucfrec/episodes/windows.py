@@ -15,7 +15,7 @@ from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import damage_explained
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
@@ -173,17 +173,7 @@ class Shown(NamedTuple):
 
     def padded(self, steps: int) -> "Shown":
         """What was shown in the latest `steps`, (B, `steps`), also where fewer are known."""
-        recent, pad = self.latest(steps), nn.functional.pad
-        if not (missing := steps - recent.items.shape[1]):
-            return recent
-        return Shown(
-            pad(
-                recent.items,
-                (0, missing),
-                value=-1,
-            ),
-            pad(recent.rewards, (0, missing)),
-        )
+        return Shown(pad_columns(self.items, steps, -1), pad_columns(self.rewards, steps, 0))
 
     def latest(self, steps: int) -> "Shown":
         """What was shown in the latest `steps` of these."""
@@ -228,6 +218,13 @@ class Exposed(_Rows):
         recent = Shown.before_last(windows.last(lags + 1)).padded(lags)
         offer = windows.offer and windows.offer.change(lambda part: part[:, -1])
         return cls(recent.items, recent.rewards, windows.returns_to_go[:, -1], offer)
+
+
+def pad_columns(values: Tensor, length: int, padding: int) -> Tensor:
+    """The first `length` columns of values (B, N), with more columns where there are fewer."""
+    missing = max(0, length - values.shape[1])
+    values = values[:, :length]
+    return nn.functional.pad(values, (0, missing), value=padding) if missing else values
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
@@ -465,50 +462,11 @@ class AugmentedEpisodes:
         save_tensors(path, arrays, {})
 
     @classmethod
-    def load(cls, path: Path, store: "EpisodeStore") -> "AugmentedEpisodes":
-        """Read a file that `save` wrote, of episodes of `store` or the store that it is a view of;
-        an InputError if it is missing, damaged or of another store."""
+    def load(cls, path: Path) -> "AugmentedEpisodes":
+        """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, _ = load_tensors(path)
-        with damage_explained(path, f"train again with {store.path}, or the store it was made of"):
-            episodes = cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
-            episodes._require_of(store)
-        return episodes
-
-    def _require_of(self, store: "EpisodeStore") -> None:
-        """Raise ValueError for arrays whose types, shapes and numbers are not of one store."""
-        for name in ("copy_source", "edit_copy", "edit_step", "action_source", "action_step"):
-            if getattr(self, name).dtype != np.int64 or getattr(self, name).ndim != 1:
-                raise ValueError(f"{name} is no list of int64")
-        edits, copies = len(self.edit_copy), len(self.action_source)
-        if len(self.edit_step) != edits or self.edit_state.shape != (edits, store.state_size):
-            raise ValueError("its edits differ in number, or its states in size")
-        if len(self.action_step) != copies or self.action_reward.shape != (copies,):
-            raise ValueError("its action copies differ in number")
-        if {self.edit_state.dtype, self.action_reward.dtype} != {np.dtype(np.float32)}:
-            raise ValueError("its states or rewards are not float32")
-        _require_below(self.edit_copy, len(self.copy_source), "a copy")
-        episodes, lengths = store.record.n_episodes, store.whole.lengths
-        edited = self.copy_source[self.edit_copy]
-        for source, copy_step, step in (
-            (self.copy_source, edited, self.edit_step),
-            (self.action_source, self.action_source, self.action_step),
-        ):
-            _require_below(source, episodes, "an episode")
-            _require_below(step, lengths[copy_step], "a step")
-        copy_changes = np.diff(self.edit_copy)
-        if (copy_changes < 0).any() or (np.diff(self.edit_step)[copy_changes == 0] <= 0).any():
-            raise ValueError("its edits are not in order")
-        shape = () if store.has_items else tuple(store.record.columns[schema.ACTION])
-        kind = np.int64 if store.has_items else np.float32
-        if copies and (self.action.dtype != kind or self.action.shape != (copies, *shape)):
-            raise ValueError("its actions have another type or size")
-        if store.has_items:
-            _require_below(self.action, len(store.item_states.embeddings), "an item")
-
-
-def _require_below(numbers: Array, ends: IntArray | int, what: str) -> None:
-    if ((numbers < 0) | (numbers >= ends)).any():
-        raise ValueError(f"it names {what} that there is not")
+        with damage_explained(path, REMEDY):
+            return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
 
 class TrainingEpisodes:

@@ -32,7 +32,7 @@ Context = Annotated[int, Field(ge=1, le=4096)]
 Layers = Annotated[int, Field(ge=1, le=128)]
 Heads = Annotated[int, Field(ge=1, le=1024)]
 Kernel = Annotated[int, Field(ge=1, le=4096)]
-Returns = Literal["auto", "session", "discounted", "horizon"]
+Returns = Literal["auto", "session", "horizon"]
 Timesteps = Annotated[int, Field(ge=1, le=10_000_000)]
 
 
@@ -51,11 +51,9 @@ class PolicyConfig:
     max_timestep: Timesteps = 1000
     """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
     return_to_go: Returns = "auto"
-    """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
-    `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
-    users, whose rest shows how many rows a user has left, and otherwise the session."""
-    discount: Annotated[float, Field(gt=0, le=1)] = 0.9
-    """γ of discounted returns-to-go."""
+    """What returns-to-go count: the whole rest of the `session`, or the next `horizon` steps.
+    `auto` is the horizon where the sessions of the log are users, whose rest shows how many rows a
+    user has left, and otherwise the session."""
     horizon: Annotated[int, Field(ge=1, le=10**6)] = 1
     """Steps that returns-to-go of a horizon count."""
     exposure: bool = False
@@ -83,7 +81,7 @@ class PolicyConfig:
         definition = self.return_to_go
         if definition == "auto":
             definition = "horizon" if session_by == "user" else "session"
-        return ReturnToGo(definition, self.discount, self.horizon)
+        return ReturnToGo(definition, self.horizon)
 
 
 class SequencePolicy(nn.Module, ABC):

@@ -53,8 +53,8 @@ def _complete(sizes: dict[str, int]) -> dict[str, int]:
 
 
 def _whole(value: object) -> object:
-    if isinstance(value, Mapping) and value.keys() != {"definition", "discount", "horizon"}:
-        raise ValueError("it needs definition, discount and horizon")
+    if isinstance(value, Mapping) and value.keys() != {"definition", "horizon"}:
+        raise ValueError("it needs definition and horizon")
     return value
 
 

@@ -261,7 +261,7 @@ def _augment(
     if not config.augment.augments:
         return None, run.record.augmentation
     if refit_of is not None:
-        return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
+        return AugmentedEpisodes.load(refit_of / AUGMENTED), run.record.augmentation
     crm, csg, augment = config.crm, config.csg, config.augment
     # A policy's own view of the episodes has augmentation of its own.
     has_own_view = run.train is not run.logged
@@ -280,7 +280,7 @@ def _augment(
             inputs["settings"] = [asdict(table) for table in (crm, csg, augment)]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
             share_stage(shared, inputs, augment_episodes.__module__, out, files, make)
-        augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
+        augmented = AugmentedEpisodes.load(out / AUGMENTED)
         return augmented, read_augmentation(out / AUGMENTATION)
 
 

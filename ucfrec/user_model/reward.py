@@ -217,22 +217,14 @@ class ItemRewardModel(nn.Module):
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
         added = added + self.sum_running(offer, items)
-        return self.score_without_state(history, users, items) + x @ self.state + added
-
-    def score_without_state(
-        self,
-        history: Shown,
-        users: Tensor | None,
-        items: Tensor,
-    ) -> Tensor:
-        """The part of `score` that does not depend on the state, (B,)."""
         earlier, repeated, alike = self.exposures(history)
         column, user_rows = items.unsqueeze(1), self._user_rows(users, items)
         exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), column)
         exposure = exposure + ((earlier == column) * repeated).sum(1)
         tastes = self.tastes_after(history)
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
-        return self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
+        fixed = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
+        return fixed + x @ self.state + added
 
     def level(
         self,
@@ -303,9 +295,8 @@ class ItemRewardModel(nn.Module):
 
     def exposures(self, history: Shown) -> tuple[Tensor, Tensor, Tensor]:
         """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
-        missing = max(0, self.lags - history.items.shape[1])
-        items = F.pad(history.items[:, : self.lags], (0, missing), value=-1)
-        liked = self.scale_rewards(F.pad(history.rewards[:, : self.lags], (0, missing)))
+        items, rewards = history.padded(self.lags)
+        liked = self.scale_rewards(rewards)
         repeated, alike, repeated_liked, alike_liked = self.exposure
         return items, repeated + repeated_liked * liked, alike + alike_liked * liked
 

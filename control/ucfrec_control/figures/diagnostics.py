@@ -15,7 +15,7 @@ from ucfrec.counterfactual.generators import (
     TangentGenerator,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, read_transitions, sample_steps
+from ucfrec.counterfactual.reward_model import CausalRewardModel, sample_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
@@ -64,7 +64,7 @@ def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     """
     _augmentation(run)
     store = store_of(run)
-    copies = AugmentedEpisodes.load(run / AUGMENTED, store)
+    copies = AugmentedEpisodes.load(run / AUGMENTED)
     rng, edits = np.random.default_rng(seed), len(copies.edit_step)
     if not edits:
         raise InputError(f"{run}: no edit of a state was accepted")
@@ -104,7 +104,7 @@ class Editing:
         load_weights(weights, crm, load_tensors(weights)[0])
         crm.eval().requires_grad_(False)
         limit = max(config.crm.max_transitions, config.csg.max_transitions)
-        fitted = read_transitions(train, *sample_steps(train, limit, config.seed))
+        fitted = train.transitions(*sample_steps(train, limit, config.seed))
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
         rng = np.random.default_rng(seed)
         rows = torch.from_numpy(rng.permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS])

@@ -111,7 +111,7 @@ def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, k
 def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
     run = runs / "tangent"
     store = EpisodeStore.open(runs.parent / "store")
-    copies = AugmentedEpisodes.load(run / "augmented.safetensors", store)
+    copies = AugmentedEpisodes.load(run / "augmented.safetensors")
     at = copies.copy_source[copies.edit_copy], copies.edit_step
     factual = store.windows(*at, 1).states[:, 0]
     std = store.split("train").state_statistics[1]

@@ -85,7 +85,7 @@ def test_a_table_is_of_the_kind_that_its_name_says(tmp_path: Path) -> None:
     frames = [pd.DataFrame({"user_id": ["a", "b,"], "score": [0.1, 1e-300]}) for _ in range(2)]
     for name in ("t", "t.parquet", "t.CSV"):
         read = pd.read_csv if name.endswith("CSV") else pd.read_parquet
-        assert write_frames(tmp_path / name, frames, {"about": "it"}) == 4
+        assert write_frames(tmp_path / name, frames) == 4
         pd.testing.assert_frame_equal(read(tmp_path / name), pd.concat(frames, ignore_index=True))
     with pytest.raises(InputError, match="CSV has no lists, as in the column tags; name a file"):
         write_frames(tmp_path / "tags.csv", [pd.DataFrame({"tags": [[1, 2]]})])

@@ -62,7 +62,6 @@ def test_steps_with_a_propensity_are_estimated_where_sessions_cannot_be(
 @pytest.mark.parametrize(
     ("option", "says"),
     [
-        (["--reward-range", "0.2", "0.1"], "the reward range is 0.2 to 0.1; name the least one"),
         (["--discount", "2"], "discount is 2.0; it must be"),
         (["--lift", "0"], "wanted_lift is 0.0; it must be"),
     ],

@@ -3,17 +3,15 @@ policy; `rank`: how policies rank what users were shown and clicked later."""
 
 import shlex
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
 from ucfrec.commands.shared_options import (
     LogOptions,
     RuleOptions,
     RunArgument,
-    SparkOption,
     find_runs,
 )
 from ucfrec.errors import InputError
@@ -22,7 +20,6 @@ from ucfrec.files.remote import origin
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Selection
     from ucfrec.results.rows import Ranking, ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -42,9 +39,6 @@ class Ope(RuleOptions, LogOptions):
     """Compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1"""
     temperatures: Annotated[str | None, "T,…"] = None
     """Compare drawing items at these temperatures; 0 takes the best: 0,0.5,1"""
-    scored: bool = False
-    """LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: one row
-    per session is in memory, and there are no reward models (DM, FQE, DR)"""
     seed: int = 0
     """Of the folds and the bootstrap."""
     json: Path | None = None
@@ -52,7 +46,6 @@ class Ope(RuleOptions, LogOptions):
     details: bool = False
     """Also print all estimates, and what was read."""
     discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
-    reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return"""
@@ -80,8 +73,6 @@ class Ope(RuleOptions, LogOptions):
             settings["wanted_lift"] = self.lift
         settings |= {"users_known": not self.anonymous, "guardrails": tuple(self.guardrail)}
         options = evaluate.EstimateOptions(**settings)
-        if self.scored and not logs:
-            raise InputError("--scored needs what ucfrec score wrote; name it after the run")
         # On the test split, the weights that have not learned from it.
         policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
@@ -95,13 +86,10 @@ class Ope(RuleOptions, LogOptions):
         reports: dict[str, OffPolicyReport] = {}
         details: list[str] = []
         for policy, rules in candidates:
-            reading: AbstractContextManager[LoggedSessions | None] = nullcontext()
-            if not self.scored:
-                reading = self.read_sessions([policy], logs, self.json, True, options)
-            with reading as logged:
-                if logged is not None and logs:
+            with self.read_sessions([policy], logs, self.json, True, options) as logged:
+                if logs:
                     details.append(format_summary(logged.report))
-                elif logged is not None:
+                else:
                     store = logged.store
                     sizes = f"{store.n_episodes:,} sessions, {store.n_steps:,} steps"
                     details.append(f"test split of {store.path}: {sizes}")
@@ -109,7 +97,7 @@ class Ope(RuleOptions, LogOptions):
                     name = names[len(reports)]
                     reports[name] = estimate_return(
                         (policy, rule),
-                        [Path(log) for log in logs] if logged is None else logged,
+                        logged,
                         logs or [TEST_SPLIT],
                         options=options,
                         seed=self.seed,
@@ -168,9 +156,7 @@ def _describe(name: str, report: "OffPolicyReport") -> str:
     lines += [
         f"  {', '.join(methods) or 'sessions'}: {reason}" for reason, methods in reasons.items()
     ]
-    if report.models is not None:
-        lines.append(f"models: {report.models}")
-    return "\n".join(lines)
+    return "\n".join([*lines, f"models: {report.models}"])
 
 
 def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...]) -> str:
@@ -220,48 +206,25 @@ def _read_number(option: str, word: str, example: str) -> float:
         raise InputError(f"{option}: {word!r} is not a number; write e.g. {example}") from None
 
 
-class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
+class Score(RuleOptions, LogOptions, RunArgument):
     """`ucfrec score`."""
 
     described_by = "ucfrec.python_api.recommender:Recommender.score"
 
     out: Annotated[Path, OUTPUT]
-    """Parquet or CSV file (with --engine spark: folder) to write; ope reads Parquet."""
-    engine: Literal["torch", "spark"] = "torch"
-    """What computes the probabilities: this process; or Spark's workers, each for some of the
-    users, which write the parts of a folder --out"""
+    """Parquet or CSV file to write."""
 
     def execute(self) -> None:
         """Write the policy's probability of every logged choice."""
         from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.logs.summary import format_report
-        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
+        from ucfrec.off_policy.score import score
 
-        if (master := self.find_spark()) is None:
-            require_table_names([self.out])
+        require_table_names([self.out])
         trained = self.load(self.run)
-        rule = self.make_rule(trained)
-        if master is not None:
-            from ucfrec.off_policy.scored import score_with_spark
-
-            files, mapping = self.find_logs(self.logs, trained, [self.out])
-            sessions = score_with_spark(
-                trained,
-                files,
-                mapping,
-                self.out,
-                master,
-                checkpoint=self.checkpoint,
-                rule=rule,
-                memory_limit=self.memory_limit,
-            )
-            print(f"{origin(self.out)}: {sessions:,} sessions")
-            return
         with self.read_sessions([trained], self.logs, self.out) as logged:
             print(format_report(logged.report))
-            frames = score(trained, logged, rule)
-            unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}
-            rows = write_frames(self.out, frames, about_scores(trained, rule) | unknown)
+            rows = write_frames(self.out, score(trained, logged, self.make_rule(trained)))
         print(f"\n{origin(self.out)}: {rows:,} rows")
 
 

@@ -1,6 +1,6 @@
 """What untrusted Parquet files may claim, columns of ids, and writing tables."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,21 +92,14 @@ def table_writer(scratch: Path, out: Path, schema: "pa.Schema") -> Any:
     return csv.CSVWriter(scratch, schema)
 
 
-def write_frames(
-    out: Path, frames: "Iterable[pd.DataFrame]", metadata: Mapping[str, str] | None = None
-) -> int:
-    """Write `frames` one after the other as a single file, atomically; returns its rows.
-
-    `metadata` is added to that of the schema, which CSV does not have.
-    """
+def write_frames(out: Path, frames: "Iterable[pd.DataFrame]") -> int:
+    """Write `frames` one after the other as a single file, atomically; returns its rows."""
     import pyarrow as pa
 
     rows, writer = 0, None
     with atomic_file(out) as scratch:
         for frame in frames:
             table = pa.Table.from_pandas(frame, preserve_index=False)
-            entries = {**(table.schema.metadata or {}), **(metadata or {})}
-            table = table.replace_schema_metadata(entries)
             writer = writer or table_writer(scratch, out, table.schema)
             writer.write_table(table)
             rows += len(frame)

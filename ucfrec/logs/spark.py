@@ -213,8 +213,6 @@ class UserLog:
     """Scalar SQL expression over the files' columns."""
     session_by: str | None
     """As of `LogTables`."""
-    known_items: Path | None = None
-    """`items.parquet` of a store or run: rows with other items are left out; None for all."""
 
 
 def map_users(
@@ -231,7 +229,6 @@ def map_users(
     """
     # Workers have a working folder of their own.
     files = [file.absolute() for file in log_files(source.paths)]
-    known_items = source.known_items and source.known_items.absolute()
     with (
         scratch_folder(folder.absolute(), "users") as scratch,
         engine(files, scratch) as connection,
@@ -240,7 +237,7 @@ def map_users(
         tables = open_log_tables(
             connection, files, source.mapping, source.reward, source.session_by
         )
-        log, rows = _type_rows(spark, tables, known_items, scratch)
+        log, rows = _type_rows(spark, tables, None, scratch)
         log.require_items()
         faults = dict(rows.groupBy("fault").count().collect())
         dropped = {reason: faults.get(number, 0) for number, reason in enumerate(REASONS, 1)}

@@ -45,11 +45,11 @@ _MOST_DAYS = 28
 class Traffic:
     """How the logs came about, as far as plans for more of them need it."""
 
-    days: float | None = None
-    """From the first row to the last."""
-    users: int = 0
-    steps: int = 0
-    draws: float | None = None
+    days: float
+    """From the first session to the last."""
+    users: int
+    steps: int
+    draws: float
     """E[w²] of uniform draws from the catalogue, whose weights w have mean 1."""
 
     def plan_more(self, diagnosis: Diagnosis) -> str:
@@ -62,7 +62,7 @@ class Traffic:
 
     def plan_exploration(self) -> str:
         """The share of random items, and for how many days, that lets each step be evaluated."""
-        if not self.days or self.draws is None:
+        if not self.days:
             return ""
         # Sums of n weights of a user have a variance of (E[w²] − 1) / n, in units of their mean.
         spreads = [(self.draws / share - 1) * self.users / self.steps for share in _SHARES]
@@ -75,9 +75,6 @@ class Traffic:
             f"serve with --explore {share:g} for {_format_days(wait)} of such traffic, after which "
             "each step can be evaluated"
         )
-
-
-UNKNOWN_TRAFFIC: Final = Traffic()
 
 
 @dataclass(frozen=True)

@@ -136,12 +136,12 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     weights, last = steps.weights, steps.session_weights
     if not last.any():
         return {}
-    ones, per_decision, by_step = np.ones(len(last)), steps.per_decision, steps.by_step
-    if per_decision is None:
-        per_decision = steps.per_session(steps.discounts * weights * steps.reward)
-    if by_step is None:
-        by_step = estimate_by_step(steps)
-    terms = {"PDIS": Terms(per_decision, ones, last), "SNPDIS": Terms(by_step, ones, last)}
+    ones = np.ones(len(last))
+    per_decision = steps.per_session(steps.discounts * weights * steps.reward)
+    terms = {
+        "PDIS": Terms(per_decision, ones, last),
+        "SNPDIS": Terms(estimate_by_step(steps), ones, last),
+    }
     if steps.model is not None:
         q, v = steps.model.q, steps.model.v
         if steps.positions == "independent":
@@ -150,8 +150,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         left = steps.reward - q
         corrected = weights * left + steps.weights_before * v
         terms["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
-        by_step = normalise_by_step(steps, left, v, StepSums.of(steps, left))
-        terms["SNDR"] = Terms(by_step, ones, last)
+        terms["SNDR"] = Terms(normalise_by_step(steps, left, v), ones, last)
     if steps.place is not None:
         return terms
     terms["IPS"] = Terms(last * steps.returns, ones, last)
@@ -221,55 +220,32 @@ def mean_squared_error(
     return float(np.var(value + shrunk * left)) / len(weights) + bias**2
 
 
-@dataclass(frozen=True)
-class StepSums:
-    """Sums over sessions by step, T of the longest."""
-
-    sessions: int
-    totals: Float64Array
-    """(T,) as of `LoggedSteps.step_totals`."""
-    rewarded: Float64Array
-    """(T,) Σ_i w_it left_it, with the reward or what a model leaves of it."""
-
-    @classmethod
-    def of(cls, steps: LoggedSteps, left: Float64Array) -> "StepSums":
-        """The sums of some sessions; `left` has a number a step."""
-        rewarded = np.bincount(steps.step, steps.weights * left).astype(np.float64)
-        return cls(len(steps.first), steps.step_totals(), rewarded)
-
-    def __add__(self, more: "StepSums") -> "StepSums":
-        totals, rewarded = np.zeros((2, max(len(self.totals), len(more.totals))))
-        for sums in (self, more):
-            # Sessions that have ended keep the weight of their last step, and have no reward.
-            padding = 0, len(totals) - len(sums.totals)
-            totals += np.pad(sums.totals, padding, "edge")
-            rewarded += np.pad(sums.rewarded, padding)
-        return StepSums(self.sessions + more.sessions, totals, rewarded)
-
-
 def estimate_by_step(steps: LoggedSteps) -> Float64Array:
     """(S,) whose mean is SNPDIS, and whose spread is its error to first order."""
-    return normalise_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
+    return normalise_by_step(steps, steps.reward, None)
 
 
 def normalise_by_step(
     steps: LoggedSteps,
     left: Float64Array,
     v: Float64Array | None,
-    sums: StepSums,
 ) -> Float64Array:
     """(S,) estimate plus influence (the derivative by a session's share) of each session.
 
     The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it
-    over all sessions. In the bootstrap its influences stand for it: one number a session.
+    over sessions. In the bootstrap its influences stand for it: one number a session.
 
     Args:
         left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
-        sums: of all sessions, which may be more than those of `steps` where `v` is None.
     """
-    weights, step, sessions, totals = steps.weights, steps.step, sums.sessions, sums.totals
+    weights, step, sessions, totals = (
+        steps.weights,
+        steps.step,
+        len(steps.first),
+        steps.step_totals(),
+    )
     by_step = steps.discount ** np.arange(len(totals))
-    rewarded = by_step * sums.rewarded / totals
+    rewarded = by_step * np.bincount(step, weights * left) / totals
     mine = steps.discounts * weights * left / totals[step]
     # What W_t in the denominators takes off, for each unit of weight at step t.
     slopes = rewarded / totals

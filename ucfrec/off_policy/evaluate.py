@@ -17,7 +17,6 @@ from ucfrec.errors import InputError
 from ucfrec.off_policy.answer import (
     DAY_MS,
     MOST_LINES,
-    UNKNOWN_TRAFFIC,
     Traffic,
     Verdict,
     add_reasons,
@@ -49,7 +48,7 @@ from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.rows import ResultRow, ResultTable, write_results
 from ucfrec.runs.record import read_candidates
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.settings import require, settings_table
+from ucfrec.settings import settings_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,8 +62,6 @@ class EstimateOptions:
     """Discount factor γ of the estimated returns."""
     users_known: bool = True
     """Whether users are persons; if not, each session is taken to be of another user."""
-    reward_range: tuple[float, float] | None = None
-    """Least and greatest reward of a step, for bounds of the value; unset, those observed."""
     wanted_lift: Annotated[float, Field(gt=0)] | None = None
     """Return per session that a launch should gain; unset, 5% of the mean logged return."""
     item_groups: Annotated[int, Field(ge=0)] = 0
@@ -84,8 +81,6 @@ class EstimateOptions:
         return tuple(Guardrail.parse(text).measure for text in self.guardrails)
 
     def __post_init__(self) -> None:
-        low, high = self.reward_range or (0.0, 0.0)
-        require(low <= high, f"the reward range is {low} to {high}; name the least one first")
         for text in self.guardrails:
             Guardrail.parse(text)
 
@@ -113,8 +108,8 @@ class OffPolicyReport(ResultTable):
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
-    models: ModelReport | None
-    """How good the models of DM, FQE and DR are; None from scored rows."""
+    models: ModelReport
+    """How good the models of DM, FQE and DR are."""
     returns: Float64Array
     """(S,) of the logged sessions with all their propensities; empty if none has."""
     user: IntArray | None
@@ -158,18 +153,18 @@ class WeighedLogs:
     """Logged steps, and what the logs say of an estimate beside their weights."""
 
     steps: LoggedSteps
-    rows: int
     columns: dict[str, Any]
     """Further columns of the result rows."""
-    segment: IntArray | None = None
-    declared: str = ""
-    fingerprint: str | None = None
-    models: ModelReport | None = None
-    measures: Mapping[str, Float64Array] = field(default_factory=dict)
-    groups: Groups | None = None
+    segment: IntArray
+    """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
+    declared: str
+    fingerprint: str
+    models: ModelReport
+    measures: Mapping[str, Float64Array]
+    groups: Groups | None
     """As of `LoggedSessions`."""
-    traffic: Traffic = UNKNOWN_TRAFFIC
-    nearby: str = ""
+    traffic: Traffic
+    nearby: str
     """See `name_nearby_rule`."""
     forbidden: list[str] = field(default_factory=list)
     """What forbids a conclusion."""
@@ -202,11 +197,27 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **{f"model_{name}": value for name, value in asdict(models).items()},
     }
+    times = store.column(schema.TIMESTAMP)[steps.first]
+    quartiles = np.quantile(times, [0.25, 0.5, 0.75])
+    n_items, in_catalogue = len(trained.items), steps.groups.number >= 0
     logs = WeighedLogs(
-        steps, len(steps.reward), columns, None, declared, store.record.fingerprint, models
+        steps,
+        columns,
+        segment=1 + np.searchsorted(quartiles, times, side="right"),
+        declared=declared,
+        fingerprint=store.record.fingerprint,
+        models=models,
+        measures=logged.measures,
+        groups=logged.groups,
+        traffic=Traffic(
+            days=float(np.ptp(times)) / DAY_MS,
+            users=len(np.unique(steps.users)),
+            steps=len(steps.reward),
+            draws=concentration * n_items,
+        ),
+        nearby=name_nearby_rule(trained, rule),
     )
     _doubt_logs(logs, logged)
-    n_items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, n_items)
     if implied is not None and not implied.passed:
         logs.forbidden.append(
@@ -214,26 +225,14 @@ def evaluate_off_policy(
             f"{implied.error * n_items:,.0f} items to choose from, the run knows {n_items:,}: "
             "propensities are too small"
         )
-    # The quarter of the logs, 1 to 4 by time, in which each session begins.
-    times = store.column(schema.TIMESTAMP)[steps.first]
-    quartiles = np.quantile(times, [0.25, 0.5, 0.75])
-    logs.segment = 1 + np.searchsorted(quartiles, times, side="right")
-    logs.traffic = Traffic(
-        days=float(np.ptp(times)) / DAY_MS,
-        users=len(np.unique(steps.users)),
-        steps=len(steps.reward),
-        draws=concentration * n_items,
-    )
     clusters = steps.cluster_weights
     if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
         # The estimated probabilities of groups are not good enough for sessions of this length.
-        steps = replace(steps, cluster_propensity=None, cluster_target=None)
+        logs.steps = replace(steps, cluster_propensity=None, cluster_target=None)
         logs.remarks.append(
             f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
-    logs.steps, logs.nearby = steps, name_nearby_rule(trained, rule)
-    logs.measures, logs.groups = logged.measures, logged.groups
-    return make_report(trained, rule, logs, seed, options)
+    return _make_report(trained, rule, logs, seed, options)
 
 
 def name_nearby_rule(trained: TrainedPolicy, rule: DecisionRule) -> str:
@@ -249,7 +248,7 @@ def name_nearby_rule(trained: TrainedPolicy, rule: DecisionRule) -> str:
     return f"evaluate a rule that such logs support: {options}" if options else ""
 
 
-def make_report(
+def _make_report(
     trained: TrainedPolicy,
     rule: DecisionRule,
     logs: WeighedLogs,
@@ -259,7 +258,6 @@ def make_report(
     """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
     mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
     """
-    model = logs.models
     steps, diagnosis, verdict = _conclude_lists(logs, seed, options)
     weighable = None if steps.lacking.all() else steps.weighable
     verdict, terms = _add_evidence(logs, steps, diagnosis, verdict, seed, options)
@@ -267,7 +265,7 @@ def make_report(
     if verdict.per_step is not None and (single := cut_to_steps(logs.steps)) is not None:
         of_steps = add_reasons(estimate(single, seed), verdict.per_step.reasons)
     estimates = add_reasons(estimate(steps, seed), verdict.reasons)
-    if model is not None and not model.converged:
+    if not logs.models.converged:
         diverged = "it diverged: its values exceed the largest possible return"
         estimates["FQE"] = replace(estimates["FQE"], reasons=(diverged,))
     if 0 < diagnosis.left_out < diagnosis.sessions:
@@ -293,7 +291,7 @@ def make_report(
             "positions": steps.positions if logs.steps.place is not None else None,
             "anonymous": not options.users_known,
             "sessions": len(steps.first),
-            "steps": logs.rows,
+            "steps": len(steps.reward),
             "choice": "softmax" if rule.draws else "greedy",
         },
         config_hash=config_hash(record.settings),
@@ -334,7 +332,7 @@ def _conclude_lists(
     if steps.place is not None:
         ways = [merge_lists(steps), steps, replace(steps, positions="independent")]
     for way in ways:
-        diagnosis = diagnose(way, options.reward_range, logs.segment)
+        diagnosis = diagnose(way, logs.segment)
         verdict = conclude(
             way,
             seed,

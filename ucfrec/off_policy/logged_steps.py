@@ -36,7 +36,7 @@ _ROUNDING = 1e-6
 Positions: TypeAlias = Literal["whole list", "cascade", "independent"]
 _TARGETS = ("target", "cluster_target")
 _PROBABILITIES = ("propensity", "cluster_propensity", *_TARGETS)
-_COLUMNS = ("reward", *_PROBABILITIES, "per_decision", "by_step")
+_COLUMNS = ("reward", *_PROBABILITIES)
 """What there is one number of a step."""
 
 
@@ -97,10 +97,6 @@ class LoggedSteps:
     groups: ItemGroups | None = None
     densities: bool = False
     """Whether `propensity` and `target` are densities of vector actions, which may exceed 1."""
-    per_decision: Float64Array | None = None
-    """(N,) terms of PDIS, where steps are sums of whole sessions (`ucfrec.off_policy.scored`)."""
-    by_step: Float64Array | None = None
-    """(N,) those of SNPDIS."""
     place: IntArray | None = None
     """(N,) position of each step in the list of its decision, from 0; None where every step is a
     decision."""

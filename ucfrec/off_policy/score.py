@@ -1,7 +1,7 @@
 """Logs read as a policy's training logs were, and its probability of each logged choice."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -35,8 +35,6 @@ from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
-UNKNOWN_ITEMS = "unknown_item_rows"
-"""Metadata of a file of scores: number of rows left out because the run does not know the item."""
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
 MOST_SEEN: Final = 0.05
@@ -91,6 +89,7 @@ class ScoredSteps:
     """(B, d) last-layer features of the policy's window; None of item-knn and crm-greedy."""
 
 
+@contextmanager
 def read_logged_sessions(
     trained: TrainedPolicy,
     files: Sequence[Path],
@@ -99,7 +98,7 @@ def read_logged_sessions(
     memory_limit: str = "2GB",
     measures: Sequence[str] = (),
     by: str | None = None,
-) -> AbstractContextManager[LoggedSessions]:
+) -> Iterator[LoggedSessions]:
     """Read logs in the same way as the training logs of a run; they are on disk until the block of
     this context manager ends.
 
@@ -115,15 +114,7 @@ def read_logged_sessions(
             is known, or their observations are not those of the training logs.
     """
     require_items(trained)
-    mapping, options = training_options(trained, mapping, memory_limit)
-    return prepare_sessions(trained, files, mapping, options, keep_unknown, measures, by)
-
-
-def training_options(
-    trained: TrainedPolicy, mapping: LogMapping, memory_limit: str = "2GB"
-) -> tuple[LogMapping, PrepareOptions]:
-    """The mapping and options that read logs as the training logs of a policy were read."""
-    record = trained.record
+    record, mapping = trained.record, columns_used(trained, mapping)
     options = PrepareOptions(
         reward_of(trained),
         record.session_by,
@@ -132,20 +123,6 @@ def training_options(
     )
     if record.session_gap_ms is not None:
         options = replace(options, gap_minutes=record.session_gap_ms / 60_000)
-    return columns_used(trained, mapping), options
-
-
-@contextmanager
-def prepare_sessions(
-    trained: TrainedPolicy,
-    files: Sequence[Path],
-    mapping: LogMapping,
-    options: PrepareOptions,
-    keep_unknown: bool = False,
-    measures: Sequence[str] = (),
-    by: str | None = None,
-) -> Iterator[LoggedSessions]:
-    """`read_logged_sessions` of logs whose columns and options are given in full."""
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
         folder, run = scratch / "store", trained.folder
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
@@ -300,11 +277,6 @@ def score(
         yield pd.DataFrame(columns)
 
 
-def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> dict[str, str]:
-    """What files of `score` say of the policy and the rule, in the metadata of their schema."""
-    return {"run": trained.fingerprint, "rule": (rule or trained.rule).hash}
-
-
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     """The test split of the store that policies were trained on; InputError if the actions are
     vectors, the store is gone or has no test split, or a policy is a refit, trained on all rows.
@@ -346,18 +318,13 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
         if record.refit_of is None:
             in_training = logged.episode_values(schema.SPLIT) != schema.SPLITS.index("test")
         return float(in_training[logged.all_steps()[0]].mean())
-    return share_of_rows_seen(trained, np.concatenate(list(_hash_store(logged))))
-
-
-def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
-    """`share_seen` of rows by their `hash_rows`."""
     if (store := _readable_store(trained)) is None:
         return None
-    keys, rows = np.unique(keys, return_counts=True)
+    keys, rows = np.unique(np.concatenate(list(_hash_rows(logged))), return_counts=True)
     seen = np.zeros(len(keys), dtype=bool)
     # The training data may be far larger than the logs.
     for name in schema.SPLITS if trained.record.refit_of is not None else ("train", "validation"):
-        for trained_keys in _hash_store(store.split(name)):
+        for trained_keys in _hash_rows(store.split(name)):
             places = np.minimum(np.searchsorted(keys, trained_keys), len(keys) - 1)
             seen[places[keys[places] == trained_keys]] = True
     return float(rows[seen].sum() / rows.sum())
@@ -380,18 +347,14 @@ def seen_too_often(seen: float | None) -> list[str]:
     return [text] if seen is not None and seen > MOST_SEEN else []
 
 
-def _hash_store(store: EpisodeStore) -> Iterator[KeyArray]:
-    """`hash_rows` of all steps, some at a time, in order."""
+def _hash_rows(store: EpisodeStore) -> Iterator[KeyArray]:
+    """(N,) hash of each step's numbers of user and item, and its time (ms); some steps at a time,
+    in order."""
     users: Array = store.episode_values(schema.USER)
     for episodes, steps in store.step_batches() if store.n_episodes else ():
         items = store.step_values(schema.ITEM, episodes, steps)
         times = store.step_values(schema.TIMESTAMP, episodes, steps)
-        yield hash_rows(users[episodes], items, times)
-
-
-def hash_rows(users: Array, items: Array, times: Array) -> KeyArray:
-    """(N,) hash of each row's numbers of user and item, and its time (ms)."""
-    keys = np.zeros(len(users), dtype=np.uint64)
-    for values in (users, items, times):
-        keys = mix_bits(keys ^ values.astype(np.int64).view(np.uint64))
-    return keys
+        keys = np.zeros(len(steps), dtype=np.uint64)
+        for values in (users[episodes], items, times):
+            keys = mix_bits(keys ^ values.astype(np.int64).view(np.uint64))
+        yield keys

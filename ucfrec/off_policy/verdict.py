@@ -72,9 +72,6 @@ class Diagnosis:
     """Mean session product, 1 in expectation."""
     tail: float | None = None
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
-    bounds: tuple[float, float] | None = None
-    """Of the value, if propensities are true, whatever the choices that the logs lack are worth;
-    up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
     def list_columns(self) -> dict[str, Any]:
         """What speaks against the estimates, by name."""
@@ -86,18 +83,12 @@ class Diagnosis:
             "weight_tests": [asdict(test) for test in self.tests],
             "mean_weight": self.mean_weight,
             "pareto_tail": self.tail,
-            "bounds": self.bounds,
         }
 
 
-def diagnose(
-    steps: LoggedSteps,
-    reward_range: tuple[float, float] | None = None,
-    segment: IntArray | None = None,
-) -> Diagnosis:
-    """Look for what forbids an estimate: `reward_range` is the least and greatest reward of a step,
-    None for those observed; each segment (S,) of sessions, of users or weeks, is tested alone.
-    """
+def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
+    """Look for what forbids an estimate; each segment (S,) of sessions, of users or weeks, is
+    tested alone."""
     incomplete, users = steps.lacking, int(steps.users.max()) + 1
     if incomplete.all():
         return Diagnosis(len(incomplete), users, left_out=len(incomplete))
@@ -105,10 +96,6 @@ def diagnose(
     weights = weighable.session_weights
     by_user = np.bincount(weighable.users, weights).astype(np.float64)
     rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns))
-    bounds = None
-    if weighable.per_decision is None:
-        observed = float(steps.reward.min()), float(steps.reward.max())
-        bounds = identification_bounds(weighable, reward_range or observed)
     return Diagnosis(
         sessions=len(incomplete),
         users=users,
@@ -120,7 +107,6 @@ def diagnose(
         rewarded_users=int((rewarded > 0).sum()),
         mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
-        bounds=bounds,
     )
 
 
@@ -135,7 +121,6 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     samples = [
         (f"step {place}", ratios[rows], step_user[rows])
         for place, rows in enumerate(steps.rows_by_place, start=1)
-        if steps.per_decision is None
     ]
     samples.append((SESSION_PRODUCTS, weights, steps.users))
     for number in () if segment is None else np.unique(segment):
@@ -203,26 +188,6 @@ def pareto_tail(weights: Float64Array) -> float | None:
     return float(np.log1p(-best * excess).mean())
 
 
-def identification_bounds(
-    steps: LoggedSteps, reward_range: tuple[float, float]
-) -> tuple[float, float]:
-    """PDIS plus the least and the most that choices without support could return.
-
-    At step t a share 1 − E_n[w_t] of the evaluated policy's sessions has left what the logs support
-    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps has a reward in
-    `reward_range`, or nothing once the session, not longer than the longest logged, has ended.
-    """
-    totals = steps.step_totals() / len(steps.first)
-    unsupported = np.maximum(1 - totals, 0)
-    worth = float((steps.discount ** np.arange(len(totals)) * unsupported).sum())
-    supported = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
-    low, high = reward_range
-    # A single step is always taken; a longer session may end.
-    if len(totals) > 1:
-        low, high = min(low, 0.0), max(high, 0.0)
-    return float(supported + worth * low), float(supported + worth * high)
-
-
 def list_reasons(diagnosis: Diagnosis) -> list[str]:
     """What forbids a conclusion, the gravest first."""
     if diagnosis.left_out == diagnosis.sessions:
@@ -240,7 +205,7 @@ def list_reasons(diagnosis: Diagnosis) -> list[str]:
         )
     mean = diagnosis.mean_weight
     if failed := [test for test in diagnosis.tests if not test.passed]:
-        reasons.append(_explain_failure(failed, diagnosis))
+        reasons.append(_explain_failure(failed))
     elif mean is not None and abs(mean - 1) > FAR_OFF:
         reasons.append(
             f"the mean weight is {mean:.2f} where 1 is expected: at random, what the policy would "
@@ -262,7 +227,7 @@ def list_reasons(diagnosis: Diagnosis) -> list[str]:
     return reasons
 
 
-def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis) -> str:
+def _explain_failure(failed: list[WeightTest]) -> str:
     """What the worst of the failed tests shows."""
 
     def rank(test: WeightTest) -> tuple[bool, float]:
@@ -272,12 +237,8 @@ def _explain_failure(failed: list[WeightTest], diagnosis: Diagnosis) -> str:
     worst = max(failed, key=rank)
     if worst.mean >= 1:
         return f"{worst}, where 1 is expected: propensities are too small"
-    reason = (
+    return (
         f"{worst}, where 1 is expected: the logs lack choices that the policy makes, such as seen "
         "items or what requests exclude (log excludes_seen and candidates), or propensities are "
         "too large"
     )
-    if diagnosis.bounds is None:
-        return reason
-    low, high = diagnosis.bounds
-    return f"{reason} (if they are right, the value lies between {low:.4g} and {high:.4g})"

@@ -3,7 +3,6 @@ add each result to the model card of its run. Each imports only what it needs.""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ucfrec.acting.decision import DecisionRule
@@ -78,14 +77,14 @@ def rank_policies(
 
 def estimate_return(
     candidate: Candidate,
-    logged: "LoggedSessions | Sequence[Path]",
+    logged: "LoggedSessions",
     logs: Sequence[str],
     *,
     options: "EstimateOptions",
     seed: int,
     checkpoint: str = "best",
 ) -> "OffPolicyReport":
-    """Estimate the return of a session from logs, or from the files that `score` made of them.
+    """Estimate the return of a session from logs.
 
     Args:
         logs: their names in the model card.
@@ -95,14 +94,9 @@ def estimate_return(
         InputError: the logs cannot be used.
     """
     from ucfrec.off_policy.evaluate import evaluate_off_policy
-    from ucfrec.off_policy.score import LoggedSessions
-    from ucfrec.off_policy.scored import evaluate_scored
 
     trained, rule = candidate
-    if isinstance(logged, LoggedSessions):
-        report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
-    else:
-        report = evaluate_scored(trained, logged, rule=rule, seed=seed, options=options)
+    report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
     report = replace(
         report,
         rows=[replace(row, checkpoint=checkpoint) for row in report.rows],

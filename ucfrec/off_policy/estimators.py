@@ -16,26 +16,11 @@ w_i that of the whole session, E_n the mean over sessions.
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
 
-Estimators that shrink large weights take a little bias for much less variance. Each is
-E_n[v + ŵ (r − q)], with q = v = 0 for the IPS kinds, and ŵ(w; λ) for the weight w:
-
-| name | ŵ(w; λ) | source |
-|---|---|---|
-| clipped IPS | min(w, λ) | Ionides 2008; Bottou et al., JMLR 2013 |
-| sub-Gaussian IPS, sub-Gaussian DR | w / (1 − λ + λ w) | Metelli, Russo & Restelli, NeurIPS 2021 |
-| SWITCH-DR | w where w ≤ λ, else 0 | Wang, Agarwal & Dudík, ICML 2017 |
-| DRos | λ w / (w² + λ) | Su, Dimakopoulou, Krishnamurthy & Dudík, ICML 2020 |
-
-The IPS kinds shrink the weight of the whole session; the DR kinds are for sessions of one step.
-λ has the least estimated mean squared error (Su et al. 2020, section 5): the sample variance over n
-plus the square of the estimated bias E_n[(w − ŵ)(r − q)], which no interval would know.
-
 In the means over sessions at step t, a session that has ended counts with the weight of its last
 step, as if it went on without reward (Thomas & Brunskill 2016).
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
@@ -53,13 +38,12 @@ SUITE: Final = "off-policy"
 LOGGED: Final = "logged"
 _OF_MODEL = "only as good as its model, whose error no resampling shows"
 _OF_GROUPS = "right only if the reward of an item depends on its group alone"
-_OF_SHRINKING = "its shrunk weights have an error that no resampling shows"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(Evidence):
-    """Mean discounted return of a session. Its interval is that of `cluster_intervals`; DM, FQE,
-    MIPS and what shrinks weights have none, and where too few sessions have weight and reward."""
+    """Mean discounted return of a session. Its interval is that of `cluster_intervals`; DM, FQE
+    and MIPS have none, and where too few sessions have weight and reward."""
 
     value: float
     error: float | None
@@ -68,8 +52,6 @@ class Estimate(Evidence):
     """(Σw)² / Σw² of the sessions' weights (Kish 1965); S where nothing is weighted."""
     largest_weight: float
     """Share of the heaviest session in all weight."""
-    parameter: float | None = None
-    """The tuned λ of an estimator that shrinks weights."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +63,8 @@ class Terms:
     below: Float64Array
     weights: Float64Array
     """(S,) what each session counts."""
-    parameter: float | None = None
     doubt: str = ""
-    """An error that no resampling shows: of a model, or of changed weights."""
+    """An error that no resampling shows: of a model."""
 
     @property
     def influences(self) -> Float64Array:
@@ -126,7 +107,6 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
             error=error,
             effective_sessions=effective_number(weights),
             largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
-            parameter=term.parameter,
         )
     return estimates
 
@@ -158,66 +138,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         terms["MIPS"] = Terms(above, ones, clustered[steps.last], doubt=_OF_GROUPS)
-    kinds = {name: (*kind, steps.returns, 0 * ones) for name, kind in IPS_KINDS.items()}
-    if steps.model is not None and len(steps.session) == len(steps.first):
-        left, value = steps.reward - steps.model.q, steps.model.v
-        kinds |= {name: (*kind, left, value) for name, kind in DR_KINDS.items()}
-    for name, (shrink, parameters, left, value) in kinds.items():
-        parameter = tune(shrink, parameters, last, left, value)
-        shrunk = shrink(last, parameter)
-        doubt = _OF_SHRINKING if (shrunk != last).any() else ""
-        terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, doubt)
     return terms
-
-
-def shrink_optimistically(weights: Float64Array, strength: float) -> Float64Array:
-    """λ w / (w² + λ): w where λ is infinite, 0 where it is 0."""
-    if math.isinf(strength):
-        return weights
-    return strength * weights / np.maximum(weights**2 + strength, 1e-300)
-
-
-def shrink_to_sub_gaussian(weights: Float64Array, strength: float) -> Float64Array:
-    """w / (1 − λ + λ w): w where λ is 0, 1 where it is 1."""
-    return weights / np.maximum(1 - strength + strength * weights, 1e-300)
-
-
-Shrink = Callable[[Float64Array, float], Float64Array]
-_BOUNDS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0, math.inf)
-_STRENGTHS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-IPS_KINDS: Final[dict[str, tuple[Shrink, Sequence[float]]]] = {
-    "clipped IPS": (np.minimum, _BOUNDS),
-    "sub-Gaussian IPS": (shrink_to_sub_gaussian, _STRENGTHS),
-}
-"""How each shrinks weights, and the parameters λ to choose from."""
-DR_KINDS: Final[dict[str, tuple[Shrink, Sequence[float]]]] = {
-    "SWITCH-DR": (lambda weights, most: np.where(weights <= most, weights, 0.0), (0.0, *_BOUNDS)),
-    "DRos": (shrink_optimistically, (0.0, *_BOUNDS[:-1], 1e4, 1e5, math.inf)),
-    "sub-Gaussian DR": (shrink_to_sub_gaussian, _STRENGTHS),
-}
-
-
-def tune(
-    shrink: Shrink,
-    parameters: Sequence[float],
-    weights: Float64Array,
-    left: Float64Array,
-    value: Float64Array,
-) -> float:
-    """The parameter of least estimated mean squared error, of weights, r − q and v (S,)."""
-    shrunk = {parameter: shrink(weights, parameter) for parameter in parameters}
-    return min(shrunk, key=lambda most: mean_squared_error(weights, shrunk[most], left, value))
-
-
-def mean_squared_error(
-    weights: Float64Array,
-    shrunk: Float64Array,
-    left: Float64Array,
-    value: Float64Array,
-) -> float:
-    """Estimated mean squared error of E_n[value + shrunk · left] (Su et al. 2020, section 5)."""
-    bias = float(((weights - shrunk) * left).mean())
-    return float(np.var(value + shrunk * left)) / len(weights) + bias**2
 
 
 def estimate_by_step(steps: LoggedSteps) -> Float64Array:

@@ -406,7 +406,6 @@ def _make_rows(
             f"{base.metric}_error": result.error,
             f"effective_{units}": result.effective_sessions,
             "largest_weight": result.largest_weight,
-            "parameter": result.parameter,
             "reasons": result.reasons or None,
             "decision_rule": rule.as_dict(),
         }

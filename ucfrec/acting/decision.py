@@ -163,10 +163,12 @@ class DecisionRule:
         for share, logs in self._follow_best(modes, scores):
             # A further item that is never drawn stands for none.
             logs = F.pad(logs, (0, 1), value=-torch.inf)
-            before = _conditional(logs, positions).masked_fill(earlier < 0, 0.0).sum(1)
+            chance_so_far = _conditional(logs, positions).masked_fill(earlier < 0, 0.0).sum(1)
             left = logs.scatter(1, positions, -torch.inf)[:, :-1].log_softmax(1)
             totals.append(
-                math.log(share) + before.unsqueeze(1) + torch.nan_to_num(left, nan=-torch.inf)
+                math.log(share)
+                + chance_so_far.unsqueeze(1)
+                + torch.nan_to_num(left, nan=-torch.inf)
             )
         joint = torch.stack(totals).logsumexp(0)
         return torch.nan_to_num(joint - joint.logsumexp(1, keepdim=True), nan=-torch.inf).float()

@@ -115,8 +115,8 @@ class Collect(SimulationOptions):
         simulator = environment.simulator()
         behavior = self.behavior or simulator.logging_behavior
         env, actor = environment.start(256, behavior, self.seed)
-        named = {"env_name": environment.title, "behavior": behavior}
-        played = collect(simulator, env, actor, self.sessions, self.seed, self.out, **named)
+        details = {"env_name": environment.title, "behavior": behavior}
+        played = collect(simulator, env, actor, self.sessions, self.seed, self.out, **details)
         size = (env.single_observation_space.shape or (0,))[0]
         observation = f"observation of {size} numbers"
         if not size:

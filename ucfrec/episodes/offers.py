@@ -145,8 +145,8 @@ class Offer:
         first, last = torch.searchsorted(self.offers.pairs, ends)
         rows = torch.repeat_interleave(last - first)
         # Members of each set follow each other.
-        before = (last - first).cumsum(0) - last
-        members = self.offers.sets[1][torch.arange(len(rows)) - before[rows]]
+        earlier = (last - first).cumsum(0) - last
+        members = self.offers.sets[1][torch.arange(len(rows)) - earlier[rows]]
         columns = members if items is None else columns_of(members, items)
         held[rows[columns >= 0], columns[columns >= 0]] = True
         return held

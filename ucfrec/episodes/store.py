@@ -410,13 +410,14 @@ class UserRows:
         if gap_ms is None or schema.SESSION_BEGAN not in self.later.record.columns:
             return begins
         # Rows from the time on that the log names, of users by their first rows.
-        began = self.later.step_values(schema.SESSION_BEGAN, *self.later.locate(self.source[begin]))
+        episodes, steps = self.later.locate(self.source[begin])
+        began = self.later.step_values(schema.SESSION_BEGAN, episodes, steps)
         users, low = np.unique(self.first), times.min()
         owner = np.searchsorted(users, np.arange(len(times)), side="right")
         span = times.max() - low + 1
-        keys, wanted = owner * span + times - low, (began - low).clip(0, span - 1)
-        named = np.searchsorted(keys, owner[begin] * span + wanted)
-        return np.where(began < 0, begins, np.minimum(named, begin))
+        keys, wanted_keys = owner * span + times - low, (began - low).clip(0, span - 1)
+        starts_named = np.searchsorted(keys, owner[begin] * span + wanted_keys)
+        return np.where(began < 0, begins, np.minimum(starts_named, begin))
 
 
 def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray:

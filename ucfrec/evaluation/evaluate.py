@@ -199,8 +199,8 @@ def variety_columns(
         row["diversity"] = diversity(episodes, items, incidence)
     if counts is None or numbers is None:
         return row
-    known = numbers >= 0
-    impressions = np.bincount(numbers[known], counts.shown.numpy()[known], n_items)
+    in_catalogue = numbers >= 0
+    impressions = np.bincount(numbers[in_catalogue], counts.shown.numpy()[in_catalogue], n_items)
     if impressions.any():
         # In nats; an item that was never shown counts as the rarest.
         popularity = impressions / counts.episodes

@@ -152,8 +152,8 @@ def read_offers(
         intervals = np.hstack([intervals, np.stack([*rows.values()]).astype(np.int64)])
     if store is not None and has_older:
         older = Offers.load(store / OFFERS)
-        rest, sets = older.intervals, older.sets.numpy() if grows else sets
-        intervals = np.hstack([intervals, rest[:, ~np.isin(rest[0], intervals[0])]])
+        remaining, sets = older.intervals, older.sets.numpy() if grows else sets
+        intervals = np.hstack([intervals, remaining[:, ~np.isin(remaining[0], intervals[0])]])
     numbers, sets = number_sets(log, sets) or (None, sets)
     (n_items,) = log.one("SELECT count(*) FROM items")
     some = intervals.size or sets.size

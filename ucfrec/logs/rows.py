@@ -199,9 +199,9 @@ class SortedRows:
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
-        listed = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
-        if listed:
-            order = np.lexsort([*listed, times, batch[USER]])
+        list_keys = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
+        if list_keys:
+            order = np.lexsort([*list_keys, times, batch[USER]])
             batch = {name: values[order] for name, values in batch.items()}
             times = batch[schema.TIMESTAMP]
         if by_session:

@@ -117,9 +117,9 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         if cut.session_by == "gap":
             pause = times[1:] - times[:-1] > cut.gap_ms
             if schema.SESSION_BEGAN in batch:
-                before, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
-                other = np.where(before < 0, began > times[:-1], began != before)
-                pause = np.where(began < 0, pause, other)
+                previous, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
+                is_other = np.where(previous < 0, began > times[:-1], began != previous)
+                pause = np.where(began < 0, pause, is_other)
             ends = user_ends | np.append(pause, True)
             last_ends = rows.last_ms - times > cut.gap_ms
         elif cut.session_by == schema.SESSION_ID:

@@ -346,14 +346,14 @@ def _conclude_lists(
     enough = results[0][1].effective_users >= _ENOUGH_FOR_WHOLE_LISTS
     chosen = results[0 if len(results) == 1 or (enough and results[0][2].lift.is_reliable) else 1]
     if len(results) > 1:
-        others = "; ".join(
+        alternatives = "; ".join(
             f"{ASSUMPTIONS[way.positions]}: {verdict.lift.format()}"
             for way, _, verdict in results
             if way is not chosen[0]
         )
         logs.remarks.append(
             f"decisions are lists: rewards depend on {ASSUMPTIONS[chosen[0].positions]}; if they "
-            f"depend on {others}"
+            f"depend on {alternatives}"
         )
     return chosen
 

@@ -194,15 +194,15 @@ def score_steps(
             starts = store.decision_starts(episodes, steps)
             begins = np.append(True, (np.diff(episodes) != 0) | (np.diff(starts) != 0))
             first, decision = np.flatnonzero(begins), np.cumsum(begins) - 1
-            at = episodes[first], starts[first]
-            sessions = sessions_before(scorer, store, *at)
-            earlier = seen_before(store, *at) if scorer.rule.exclude_seen else None
+            owners, begins_at = episodes[first], starts[first]
+            sessions = sessions_before(scorer, store, owners, begins_at)
+            earlier = seen_before(store, owners, begins_at) if scorer.rule.exclude_seen else None
             windows = scorer.windows(sessions)
             query = scorer.query(sessions, windows)
             excluded = None
             if schema.EXCLUDES_SEEN in store.record.columns:
                 rows, seen_items = users.seen(numbers[first])
-                excludes = store.step_values(schema.EXCLUDES_SEEN, *at)[rows] > 0
+                excludes = store.step_values(schema.EXCLUDES_SEEN, owners, begins_at)[rows] > 0
                 pairs = np.unique((rows * n_items + seen_items)[excludes & (seen_items < n_items)])
                 rows, seen_items = np.divmod(pairs, n_items)
                 # A step that would have no item left excludes none.

@@ -152,8 +152,8 @@ def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
 
 def _conclude_comparison(test: Comparison) -> Finding:
     """What an A/B test says."""
-    named = {"as planned": test.planned, "whenever looked at": test.always}
-    intervals = _list_intervals(named)
+    evidence = {"as planned": test.planned, "whenever looked at": test.always}
+    intervals = _list_intervals(evidence)
     first, second = test.arms
     title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
     chart = interval_chart(title, intervals, ("no difference", 0.0))
@@ -161,10 +161,10 @@ def _conclude_comparison(test: Comparison) -> Finding:
     return Finding(f"The A/B test of {first} and {second}", test.conclusion, (), remarks, chart)
 
 
-def _list_intervals(named: Mapping[str, Evidence]) -> list[Interval]:
+def _list_intervals(evidence: Mapping[str, Evidence]) -> list[Interval]:
     return [
-        Interval(name, entry.value or 0.0, *(entry.interval or (0.0, 0.0)), entry.is_reliable)
-        for name, entry in named.items()
+        Interval(name, entry.value or 0.0, entry.low or 0.0, entry.high or 0.0, entry.is_reliable)
+        for name, entry in evidence.items()
     ]
 
 

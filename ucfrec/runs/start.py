@@ -198,8 +198,8 @@ def _mean_loss(view: EpisodeStore, scores: Tensor) -> float:
     losses = []
     for offer, items in _sample_offers(view):
         if offer is None:
-            shown = torch.from_numpy(view.column(schema.ITEM)).long()
-            return -float(scores.log_softmax(0)[shown].double().mean())
+            items = torch.from_numpy(view.column(schema.ITEM)).long()
+            return -float(scores.log_softmax(0)[items].double().mean())
         offered = offer.mask().scatter(1, items.unsqueeze(1), True)
         logs = scores.masked_fill(~offered, -torch.inf).log_softmax(1)
         losses.append(-logs.gather(1, items.unsqueeze(1)))

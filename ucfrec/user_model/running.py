@@ -64,7 +64,7 @@ class RunningRates:
         width = -(-span // bins)
         places = (times - begin) // width * n_items + items
         shape = bins, n_items
-        shown, sums = (
+        counts, sums = (
             np.bincount(places, weights, bins * n_items).reshape(shape)
             for weights in (None, earned - earned.mean())
         )
@@ -72,7 +72,7 @@ class RunningRates:
         for number, hours in enumerate(HALF_LIVES):
             decay, count, total = 0.5 ** (width / _HOUR_MS / hours), np.zeros(n_items), 0.0
             for place in range(bins):
-                count, total = decay * count + shown[place], decay * total + sums[place]
+                count, total = decay * count + counts[place], decay * total + sums[place]
                 rates[place + 1, number] = total / (count + _PRIOR)
         return cls(begin, width, torch.from_numpy(rates))
 

@@ -66,7 +66,7 @@ def test_missing_propensities_are_unknown(missing: str) -> None:
 def test_rounding_errors_above_one_count_as_one() -> None:
     above = ONES.copy()
     above[4], above[5] = 1.0000000002, 1 + 9e-7
-    names = ("propensity", "target", "cluster_propensity", "cluster_target")
+    names = ("propensity", "target")
     steps = steps_of(**dict.fromkeys(names, above))
     for name in names:
         np.testing.assert_array_equal(getattr(steps, name), ONES)
@@ -108,7 +108,6 @@ def few_others(values: Any, other: Any) -> Any:
         ({"propensity": few_others(ONES, 1.5)}, "not a density; .* the first is 1.5"),
         ({"target": few_others(ONES, 1.1)}, r"between 0 and 1; 2 of 120 are outside, .* 1\.1$"),
         ({"discount": 0.0}, "above 0 and at most 1"),
-        ({"cluster_target": ONES}, "both cluster_propensity and cluster_target"),
         ({"groups": ItemGroups(USER, ONES[:, None])}, "number has 60 values for 120 steps"),
     ],
 )

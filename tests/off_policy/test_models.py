@@ -142,16 +142,15 @@ def test_groups_are_the_clusters_of_embeddings() -> None:
     rng = np.random.default_rng(0)
     centres, true = 10 * rng.normal(size=(4, 8)), rng.integers(4, size=200)
     embeddings = (centres[true] + 0.1 * rng.normal(size=(200, 8))).astype(np.float32)
-    found = group_items(embeddings, 4, seed=0)
-    assert len(set(zip(true, found, strict=True))) == 4
-    assert set(found) == {0, 1, 2, 3}
+    found = group_items(embeddings, seed=0)
+    # Of more groups than there are centres, none has items of two.
+    assert len(set(zip(true, found, strict=True))) == len(set(found)) == 14
 
 
 @pytest.mark.parametrize(("items", "groups"), [(1, 1), (80, 9), (2000, 32)])
 def test_their_number_follows_the_catalogue(items: int, groups: int) -> None:
     embeddings = np.random.default_rng(0).normal(size=(items, 2)).astype(np.float32)
-    assert group_items(embeddings, 0, seed=0).max() + 1 == groups
-    assert not group_items(embeddings, 1, seed=0).any()
+    assert group_items(embeddings, seed=0).max() + 1 == groups
 
 
 def chain(sessions: int = 300, length: int = 4, seed: int = 0) -> tuple[Float32Array, ...]:

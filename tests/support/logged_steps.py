@@ -52,9 +52,7 @@ def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
     length = 1 if name == "bandit" else 5
     own = {"discount": float(given["gamma"])}
     if name == "bandit":
-        same = ours["cluster"] == ours["cluster"][action][:, None]
-        shares = ((ours[p] * same).sum(axis=1).clip(max=1) for p in ("behavior", "target"))
-        own = dict(zip(("cluster_propensity", "cluster_target"), shares, strict=True))
+        own = {}
     own["model"] = Modelled(reward=v, q=q[row, action], v=v, logged_reward=q[row, action])
     chosen = (ours[policy][row, action] for policy in ("behavior", "target"))
     return LoggedSteps(row // length, ours["reward"], *chosen, **own), ours | shared

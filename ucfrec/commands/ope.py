@@ -53,7 +53,6 @@ class Ope(RuleOptions, LogOptions):
     """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%', an expression
     over the columns of LOGS; repeatable; a launch needs every one"""
     by: Annotated[str | None, _ESTIMATED, "COLUMN"] = None
-    item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
     estimate_propensities: Annotated[bool, _ESTIMATED] = False
     anonymous: Annotated[bool, _ESTIMATED] = False
     """Treat each session as one of another user, for logs without user ids (as in obd)"""

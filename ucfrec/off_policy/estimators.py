@@ -14,7 +14,6 @@ w_i that of the whole session, E_n the mean over sessions.
 | SNPDIS | Σ_t γ^t E_n[w_it r_it] / E_n[w_it] | weighted PDIS: Precup 2000; Thomas 2015 |
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
-| MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
 step, as if it went on without reward (Thomas & Brunskill 2016).
@@ -37,13 +36,12 @@ SUITE: Final = "off-policy"
 """Suite of the result rows."""
 LOGGED: Final = "logged"
 _OF_MODEL = "only as good as its model, whose error no resampling shows"
-_OF_GROUPS = "right only if the reward of an item depends on its group alone"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(Evidence):
-    """Mean discounted return of a session. Its interval is that of `cluster_intervals`; DM, FQE
-    and MIPS have none, and where too few sessions have weight and reward."""
+    """Mean discounted return of a session. Its interval is that of `cluster_intervals`; DM and
+    FQE have none, and where too few sessions have weight and reward."""
 
     value: float
     error: float | None
@@ -76,7 +74,7 @@ class Terms:
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     """Mean return per session as logged, and under the evaluated policy; `seed` draws resamples.
 
-    DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
+    DM, FQE and the doubly robust need `steps.model`; all that
     weigh leave out sessions with a step of unknown propensity, which is right where propensities
     are lost at random, and are omitted where no session has any weight.
     """
@@ -135,9 +133,6 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         return terms
     terms["IPS"] = Terms(last * steps.returns, ones, last)
     terms["SNIPS"] = Terms(last * steps.returns, last, last)
-    if (clustered := steps.cluster_weights) is not None:
-        above = steps.per_session(steps.discounts * clustered * steps.reward)
-        terms["MIPS"] = Terms(above, ones, clustered[steps.last], doubt=_OF_GROUPS)
     return terms
 
 

@@ -38,7 +38,6 @@ from ucfrec.off_policy.models import (
 from ucfrec.off_policy.score import LoggedSessions, score_steps, seen_too_often, share_seen
 from ucfrec.off_policy.verdict import (
     ENOUGH_USERS,
-    FAR_OFF,
     MOST_LEFT_OUT,
     Diagnosis,
     check_catalogue_size,
@@ -64,8 +63,6 @@ class EstimateOptions:
     """Whether users are persons; if not, each session is taken to be of another user."""
     wanted_lift: Annotated[float, Field(gt=0)] | None = None
     """Return per session that a launch should gain; unset, 5% of the mean logged return."""
-    item_groups: Annotated[int, Field(ge=0)] = 0
-    """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
 
@@ -224,13 +221,6 @@ def evaluate_off_policy(
             f"the propensities imply {implied.mean * n_items:,.0f} ± "
             f"{implied.error * n_items:,.0f} items to choose from, the run knows {n_items:,}: "
             "propensities are too small"
-        )
-    clusters = steps.cluster_weights
-    if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
-        # The estimated probabilities of groups are not good enough for sessions of this length.
-        logs.steps = replace(steps, cluster_propensity=None, cluster_target=None)
-        logs.remarks.append(
-            f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
     return _make_report(trained, rule, logs, seed, options)
 
@@ -473,7 +463,7 @@ def collect_steps(
         )
     items = store.column(schema.ITEM).astype(np.int64)
     assert trained.item_states is not None
-    group_of = group_items(trained.item_states.embeddings.numpy(), options.item_groups, seed)
+    group_of = group_items(trained.item_states.embeddings.numpy(), seed)
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
     target, end, squares = np.empty(len(items)), 0, 0.0
     groups = ItemGroups(
@@ -494,16 +484,11 @@ def collect_steps(
         end = rows.stop
     columns: dict[str, Any] = {}
     declared, unknown = "", int(np.isnan(propensity).sum())
-    if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
-        group = np.maximum(groups.number, 0)
-        owner = plain.users[plain.session]
+    if options.estimate_propensities and unknown:
+        group, owner = np.maximum(groups.number, 0), plain.users[plain.session]
         behavior = fit_behavior(inputs.states, items, group, owner, seed)
-        of_group = np.take_along_axis(groups.target, group[:, None], axis=1)[:, 0]
-        columns["cluster_propensity"] = behavior.group
-        columns["cluster_target"] = np.where(groups.number < 0, 0.0, of_group).clip(0, 1)
-        if options.estimate_propensities and unknown:
-            declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
-            columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
+        declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
+        columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
     modelled, models = fit_models(inputs.chunks, plain, seed)
     steps = replace(plain, target=target, model=modelled, groups=groups, **columns)
     return steps, models, declared, squares / len(items)

@@ -34,8 +34,7 @@ _SMALLEST = 1e-300
 _ROUNDING = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
 Positions: TypeAlias = Literal["whole list", "cascade", "independent"]
-_TARGETS = ("target", "cluster_target")
-_PROBABILITIES = ("propensity", "cluster_propensity", *_TARGETS)
+_PROBABILITIES = ("propensity", "target")
 _COLUMNS = ("reward", *_PROBABILITIES)
 """What there is one number of a step."""
 
@@ -90,10 +89,6 @@ class LoggedSteps:
     """(S,) whose session it is, resampled together; None where each is of another user."""
     discount: float = 1.0
     """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
-    cluster_propensity: Float64Array | None = None
-    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS."""
-    cluster_target: Float64Array | None = None
-    """(N,) the evaluated policy's probability of it."""
     groups: ItemGroups | None = None
     densities: bool = False
     """Whether `propensity` and `target` are densities of vector actions, which may exceed 1."""
@@ -121,8 +116,6 @@ class LoggedSteps:
                     replace_field(name, _require_finite(name, values))
         if self.user is not None:
             replace_field("user", _number_users(self.user))
-        if (self.cluster_propensity is None) is not (self.cluster_target is None):
-            raise InputError("give both cluster_propensity and cluster_target, or neither")
         columns = [(name, getattr(self, name)) for name in (*_COLUMNS, "place")]
         for part in (self.model, self.groups):
             columns += vars(part).items() if part else ()
@@ -212,13 +205,6 @@ class LoggedSteps:
         if self.place is None:
             return self.weights[self.last]
         return self.per_session(self.weights) / self.lengths
-
-    @cached_property
-    def cluster_weights(self) -> Float64Array | None:
-        """(N,) products of ratios of the logged actions' clusters; None without them."""
-        if self.cluster_propensity is None or self.cluster_target is None:
-            return None
-        return self._multiply(self.cluster_target / self.cluster_propensity)
 
     def per_session(self, values: Float64Array) -> Float64Array:
         """(S,) sums of values (N,)."""
@@ -325,7 +311,7 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
     rule = "propensities must be above 0 and at most 1, the probability of the item shown and not a"
     rule += " density"
     remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
-    if name in _TARGETS:
+    if name == "target":
         outside = ~((values >= 0) & inside)
         rule, remedy = "probabilities of the evaluated policy lie between 0 and 1", ""
     if outside.any():

@@ -140,13 +140,10 @@ _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
 _MOST_ITEM_GROUPS = 32
 
 
-def group_items(embeddings: Float32Array, groups: int, seed: int) -> IntArray:
-    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D): at most so
-    many `groups` as there are different ones; 0 for the root of the number of items, from 2 to 32.
-    """
-    groups = groups or int(np.clip(round(len(embeddings) ** 0.5), 2, _MOST_ITEM_GROUPS))
-    if groups == 1:
-        return np.zeros(len(embeddings), dtype=np.int64)
+def group_items(embeddings: Float32Array, seed: int) -> IntArray:
+    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D): the root of
+    the number of items, from 2 to 32, but at most so many as there are different ones."""
+    groups = int(np.clip(round(len(embeddings) ** 0.5), 2, _MOST_ITEM_GROUPS))
     # Importing scikit-learn takes a second, which no other estimate must cost.
     from sklearn.cluster import KMeans
 

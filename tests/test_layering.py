@@ -40,10 +40,11 @@ ORDER = (
 TESTED_HERE = {
     "tests/control/test_authors_networks.py",
     "tests/control/test_paper.py",
-    "tests/control/test_settings.py",
     "tests/logs/test_fuzzed_logs.py",
     "tests/logs/test_refusals.py",
+    "tests/off_policy/test_lists.py",
     "tests/policies/test_known_answers.py",
+    "tests/recommending/test_own_policy.py",
     "tests/reporting/test_page_items.py",
     "tests/runs/test_precision.py",
     "tests/test_docs.py",

@@ -112,7 +112,7 @@ def test_a_rule_that_draws_is_explained(explorer: Explorer) -> None:
 
 def test_what_results_say_is_on_the_page(explorer: Explorer) -> None:
     page = got(explorer, "/").text
-    assert "Do not rely on this estimate" in page
+    assert "the log cannot say" in page
     assert page.count("<figure>") == 1
     assert "Mean return of a session" in page
     assert "<figure>" not in Explorer(explorer.runs).page({})

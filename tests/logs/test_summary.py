@@ -126,21 +126,6 @@ def test_a_log_of_a_single_item_is_told_of(tmp_path: Path) -> None:
     assert "all 200 rows show the same item, so there is nothing to choose between" in note
 
 
-@pytest.mark.parametrize("kind", ["int", "zone", "text"])
-def test_the_remedy_for_rows_of_one_page_works(tmp_path: Path, kind: str) -> None:
-    log = make_log().rename(columns={"timestamp": "shown_at"})
-    log["position"], log["user_id"] = np.arange(4000) % 4, np.arange(4000) // 4
-    log["shown_at"] = START + 200_000 * (np.arange(4000) // 4)
-    if kind != "int":
-        log["shown_at"] = pd.to_datetime(log.shown_at, unit="ms", utc=True)
-    if kind == "text":
-        log["shown_at"] = log.shown_at.astype(str)
-    path = write(log, tmp_path / "log.parquet")
-    (note,) = notes_of(path, LogMapping({"timestamp": "shown_at"}))
-    (remedy,) = re.findall(r"--column timestamp='(.*?)'", note)
-    assert not notes_of(path, LogMapping({"timestamp": remedy}))
-
-
 def test_batches_give_the_moments_of_all() -> None:
     generator = np.random.default_rng(0)
     values = 1e9 + generator.normal(size=(2, 1000)) * [[1], [3]]

@@ -142,11 +142,11 @@ def test_weights_of_a_policys_own_log_are_1_given_the_candidates(
     join_feedback([shown], [tmp_path / "clicks.parquet"], joined, 1)
     assert len(pd.read_parquet(tmp_path / "log.candidates.parquet")) == 1 + served
     policy = Recommender.load(trained.folder)
-    scores = policy.score(joined, rule=rule, filter_seen=True)
+    scores = policy.score(joined, rule=rule)
     assert scores.user_id.nunique() == len(scores) == 30
     np.testing.assert_allclose(scores.probability, scores.propensity, rtol=1e-5)
     mapping = LogMapping({"candidates": ""})
-    scores = policy.score(joined, rule=rule, filter_seen=True, mapping=mapping)
+    scores = policy.score(joined, rule=rule, mapping=mapping)
     assert (scores.probability / scores.propensity).mean() < 0.8
 
 

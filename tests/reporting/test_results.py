@@ -12,8 +12,9 @@ from ucfrec.errors import InputError
 from ucfrec.off_policy.ab_test import Comparison
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.results import Finding, conclude_update, read_findings
+from ucfrec.results.evidence import Evidence
 from ucfrec.results.rows import ResultRow, write_results
-from ucfrec.runs.record import Difference, UpdateVerdict
+from ucfrec.runs.record import UpdateVerdict
 
 
 def findings_of(folder: Path, *results: Any) -> list[Finding]:
@@ -120,18 +121,16 @@ def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> Non
     pairs = dict.fromkeys(("users", "in_arm", "rows", "without_value"), (500, 500))
     test = Comparison(
         column="clicks", arms=("old", "new"), values=(1.0, 1.5), shares=(0.5, 0.5),
-        difference=0.5, error=0.1, low=0.3, high=0.7, always_low=0.125, always_high=0.875,
+        planned=Evidence(0.5, 0.3, 0.7), always=Evidence(0.5, 0.125, 0.875), several_names=("a", "b"),
         **pairs, **counts,
     )  # fmt: skip
-    difference = Difference(measure="reward", value=2.0, low=1.0, high=3.0)
-    doubtful = Difference(measure="ndcg", value=-9.0, low=-10.0, high=-8.0, doubt="few users")
-    verdict = UpdateVerdict(
-        result="better", decided_by="reward", differences=(difference, doubtful), steps=9, users=5
-    )
+    doubtful = Evidence(-9.0, -10.0, -8.0, ("few users",))
+    differences = {"reward": Evidence(2.0, 1.0, 3.0), "ndcg": doubtful}
+    verdict = UpdateVerdict(decided_by="reward", differences=differences, steps=9, users=5)
     record = {"update": {"of": "run-1", "verdict": verdict.model_dump()}}
     screened = {"dropped": 3, "columns": [1, 2], "verdict": "no effect"}
     ab, update, others = findings_of(tmp_path, asdict(test), record, screened)
-    assert ab.answer == "new is better than old"
+    assert ab.answer == test.conclusion
     assert ab.chart is not None
     assert "whenever looked at: 0.5 [0.125, 0.875]. For comparison, no difference: 0" in (
         ab.chart.summary
@@ -145,4 +144,4 @@ def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> Non
         "", [("dropped", ["3"]), ("verdict", ["no effect"])]
     )  # fmt: skip
     with pytest.raises(InputError, match="is damaged"):
-        findings_of(tmp_path, {"always_low": 1})
+        findings_of(tmp_path, {"always": 1})

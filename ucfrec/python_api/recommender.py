@@ -11,9 +11,9 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final, Self
 
-import numpy as np
 import pandas as pd
 
+from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
@@ -52,6 +52,7 @@ from ucfrec.runs.config import TABLES, resolve_config, settings_given
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import (
     check_arguments,
+    require_ids,
     require_kind,
     require_list,
     require_number,
@@ -289,7 +290,9 @@ class Recommender:
             sorted order; fewer rows if fewer items remain, as with less than k candidates.
         """
         trained = self.trained
-        allowed = None if candidates is None else list(candidates)
+        allowed = None
+        if candidates is not None:
+            allowed = require_ids("candidates", candidates, schema.ITEM_ID)
         decisions = decide(
             trained,
             read_histories(trained, histories, mapping, users),
@@ -311,7 +314,7 @@ class Recommender:
                     trained,
                     hashed,
                     decisions,
-                    None if allowed is None else np.asarray(allowed),
+                    allowed,
                     excludes_seen=filter_seen,
                     at=at,
                 )

@@ -124,7 +124,7 @@ def _select_values(row: ResultRow, names: Sequence[str]) -> dict[str, object]:
     """The named values, with the intervals of those that have one."""
     values = dict(zip(names, map(row.as_line().get, names), strict=True))
     for name, (low, high) in row.intervals.items():
-        if name in values:
+        if values.get(name) is not None:
             values[name] = f"{values[name]:.4g} [{low:.4g}, {high:.4g}]"
     return values
 

@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
@@ -222,8 +221,6 @@ def test_the_frame_has_the_rows_of_the_log_and_a_notebook_shows_it(tmp_path: Pat
     assert set(test.split) == {"test"}
     assert len(test) == (frame.split == "test").sum()
     assert all(f"<td>{name}</td>" in store._repr_html_() for name in ("all", *schema.SPLITS))
-    mpl.use("Agg")
-    assert sum(bar.get_height() for bar in store.plot().patches) == len(store)
 
 
 def with_bot(log: pd.DataFrame, rows: int) -> pd.DataFrame:

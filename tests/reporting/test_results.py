@@ -121,7 +121,8 @@ def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> Non
     pairs = dict.fromkeys(("users", "in_arm", "rows", "without_value"), (500, 500))
     test = Comparison(
         column="clicks", arms=("old", "new"), values=(1.0, 1.5), shares=(0.5, 0.5),
-        planned=Evidence(0.5, 0.3, 0.7), always=Evidence(0.5, 0.125, 0.875), several_names=("a", "b"),
+        planned=Evidence(0.5, 0.3, 0.7), always=Evidence(0.5, 0.125, 0.875),
+        several_names=("a", "b"),
         **pairs, **counts,
     )  # fmt: skip
     doubtful = Evidence(-9.0, -10.0, -8.0, ("few users",))

@@ -27,7 +27,6 @@ from ucfrec.files.parquet import read_ids
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
 
 __all__ = ["ITEM_STATES", "EpisodeStore"]
 
@@ -173,16 +172,6 @@ class EpisodeStore(EpisodeView):
         """Identifiers of the logs; the numbers themselves in a store without their table."""
         path = self.path / _FILES[column]
         return read_ids(path, column)[numbers] if path.exists() else numbers
-
-    def plot(self, ax: "Axes | None" = None) -> "Axes":
-        """Histogram of the episodes' returns on matplotlib axes."""
-        from matplotlib import pyplot
-
-        axes = pyplot.subplots()[1] if ax is None else ax
-        axes.hist(self.returns, bins=30)
-        axes.set_xlabel(f"return of an episode (sum of {self.record.reward})")
-        axes.set_ylabel("episodes")
-        return axes
 
     def _repr_html_(self) -> str:
         table = "<tr><th></th><th>episodes</th><th>steps</th><th>mean return</th></tr>"

@@ -467,11 +467,7 @@ def collect_steps(
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
     target, end, squares = np.empty(len(items)), 0, 0.0
     groups = ItemGroups(
-        np.where(
-            items >= 0,
-            group_of[items],
-            -1,
-        ),
+        np.where(items >= 0, group_of[items], -1),
         array_on_disk((len(items), one_hot.shape[1])),
     )
     inputs = InputsFile(len(items))

@@ -237,24 +237,16 @@ class LoggedSteps:
     def select(self, sessions: BoolArray) -> "LoggedSteps":
         """The sessions that a mask (S,) marks, renumbered."""
         rows = np.flatnonzero(sessions[self.session])
-        numbers = (np.cumsum(sessions) - 1)[self.session[rows]]
-        return self.regroup(rows, numbers, None if self.user is None else self.user[sessions])
-
-    def regroup(
-        self,
-        rows: IntArray,
-        session: IntArray,
-        user: IntArray | None,
-    ) -> "LoggedSteps":
-        """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
-        taken: dict[str, Any] = {}
+        taken: dict[str, Any] = {"session": (np.cumsum(sessions) - 1)[self.session[rows]]}
+        if self.user is not None:
+            taken["user"] = self.user[sessions]
         for name, value in vars(self).items():
             if name in (*_COLUMNS, "place") and value is not None:
                 taken[name] = value[rows]
             elif isinstance(value, (Modelled, ItemGroups)):
                 columns = {key: column[rows] for key, column in vars(value).items()}
                 taken[name] = replace(value, **columns)
-        return replace(self, session=session, user=user, **taken)
+        return replace(self, **taken)
 
     def _multiply(self, ratios: Float64Array) -> Float64Array:
         """(N,) products of ratios (N,) from the session's first step to each, in place."""

@@ -156,8 +156,6 @@ def group_items(embeddings: Float32Array, seed: int) -> IntArray:
 class BehaviorModel:
     """Estimated probabilities of what was logged, and how good they are."""
 
-    group: Float64Array
-    """(N,) of the logged item's group."""
     item: Float64Array
     """(N,) of the logged item."""
     log_loss: float
@@ -218,7 +216,6 @@ def fit_behavior(
         np.add.at(table, (np.arange(count), tenth), beyond)
     shares = np.stack([model.shares for model in models])[folds, group]
     return BehaviorModel(
-        group=np.where(in_catalogue, of_group, 1.0),
         item=np.where(in_catalogue, of_group * _item_shares(item, group, folds), 1.0),
         log_loss=float(-np.log(of_group[in_catalogue]).mean()),
         share_log_loss=float(-np.log(shares[in_catalogue]).mean()),

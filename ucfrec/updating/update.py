@@ -31,8 +31,6 @@ class UpdateOptions:
 
     append: AppendOptions = field(default_factory=AppendOptions)
     """How the store grows."""
-    seed: int | None = None
-    """Of everything random; None for that of the run."""
     refit: bool = True
     """Go on learning from the newest rows, too, once the runs are compared; see
     `ucfrec.runs.refit`."""
@@ -100,8 +98,7 @@ def update_run(
         # In place of the settings of the rule's choice, it has the rule.
         settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
-    config, seed = warm_settings(full), options.seed
-    config = replace(config, seed=config.seed if seed is None else seed)
+    config = warm_settings(full)
     if not options.allow_argmax:
         config = replace(config, rule=_keep_drawing(config.rule, trained.rule))
     update = Update(

@@ -57,13 +57,14 @@ class News:
         """Probabilities of a click on each article of a page, from the top."""
         odds = 3.2 * self.taste[visitor, self.section[articles]] + 0.7 * self.quality[articles]
         odds -= 2.7 + 0.02 * (hour - self.published[articles]) + 0.12 * np.arange(len(articles))
-        return 1 / (1 + np.exp(-odds))
+        return np.asarray(1 / (1 + np.exp(-odds)))
 
     def draw_log(self, sessions: int, seed: int) -> pd.DataFrame:
         """Sessions of one to six pages, which clicks make longer."""
         rng, rows = np.random.default_rng([seed, 1]), []
         for hour in np.sort(rng.uniform(0, 24 * DAYS, sessions)):
-            visitor, explores, seen = rng.integers(VISITORS), rng.random() < 0.1, set[int]()
+            visitor, explores = int(rng.integers(VISITORS)), rng.random() < 0.1
+            seen = set[int]()
             for page in range(LONGEST):
                 fresh = np.setdiff1d(self.alive(hour), list(seen))
                 score = rng.gumbel(size=len(fresh))

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -339,7 +339,8 @@ def _covered(world: World, run: Path, log: Path) -> Iterator[bool | None]:
         propensity = store.step_values("propensity", *places).astype(np.float64)
         assert trained.item_ids is not None
         chances = world.catalog.click_probabilities[users.astype(np.int64)][:, trained.item_ids]
-        scores = torch.cat([each.scores for each in score_steps(trained, store)])
+        of_users = UserRows.of(store, logged.users[: len(store)], None)
+        scores = torch.cat([batch.scores for batch in score_steps(trained, store, of_users)])
         for rule in rules:
             chosen = rule.log_probabilities(scores).double().exp().numpy()
             weight = chosen[np.arange(len(items)), items] / propensity

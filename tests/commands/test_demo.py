@@ -33,7 +33,7 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(
     assert {str(row) for row in written} == {str(row) for row in rows}
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
-        assert f"R_cum in {environment}" in page
+        assert f"{environment}: R_cum with" in page
         methods = {*TINY.methods} - ({SHARED} if environment == "synthetic-taobao" else set())
         of_environment = {row.method: row for row in rows if row.environment == environment}
         assert of_environment.keys() == methods | {*BEHAVIORS}
@@ -45,7 +45,7 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(
             assert row.command
             assert row.versions
         for name in methods:
-            assert f"<summary>{environment}/{name}</summary>" in page
+            assert f"<summary>{environment}/{name}: run.json</summary>" in page
         said = conclusion(environment, of_environment)
         assert f"UCF reaches {of_environment['ucf'].value:.3g} [" in said
         assert ("with the shared components" in said) == (SHARED in methods)

@@ -105,7 +105,7 @@ class Offer:
 
     def has(self, items: Tensor) -> Tensor:
         """(M,) bool, whether one item (M,) of each decision was on offer."""
-        offers, times = self.offers, self.times
+        offers, times, items = self.offers, self.times, items.contiguous()
         offered = (offers.begin[items] <= times) & (times < offers.end[items])
         item, begin, end = offers.later
         first, last = (torch.searchsorted(item.contiguous(), items, right=r) for r in (False, True))

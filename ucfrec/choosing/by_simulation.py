@@ -185,6 +185,8 @@ class RuleSearch:
         self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
         self._list = train.usual_list()
+        self.shows_lists = self._list > 1
+        """Whether a decision is a list, whose rules differ less than single items do."""
         counts = train.item_counts()
         if problem.validation.has_offers:
             # What is new in the validation sessions is not in the training ones.
@@ -429,8 +431,8 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     """Choose target, minimum target and temperature, then the reward weight, and what
     `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
 
-    For new users, the rules of the highest value are then simulated in more sessions. Of rules that
-    the model cannot distinguish, the one with the most support in the log is taken.
+    For new users and lists, rules of the highest value are then simulated in more sessions. Of
+    rules that the model cannot distinguish, the one with the most support in the log is taken.
     """
     search, where = RuleSearch(problem), ""
     if problem.start is None:
@@ -441,7 +443,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         rules = find_neighbours(problem.start, problem, more)
         candidates = search.simulate([*dict.fromkeys(rules)])
     finalists = candidates
-    if search.users.reward_report.new_users:
+    if search.users.reward_report.new_users or search.shows_lists:
         finalists = search.finalists(candidates, search.best(candidates))
         again = {finalist.rule for finalist in finalists}
         candidates = [*(item for item in candidates if item.rule not in again), *finalists]
@@ -467,6 +469,10 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     candidates = search.simulate([rule for of in plain for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
     candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
+    if search.shows_lists:
+        # Without repetition, rules at a low temperature show many items, too.
+        grid = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
+        candidates += search.simulate(_vary(first, **grid))
     second = search.best(candidates).rule
     if search.users.session_end_report.kept != "constant":
         # More than randomness ends sessions.

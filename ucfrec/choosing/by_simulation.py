@@ -184,9 +184,7 @@ class RuleSearch:
         new = self.users.reward_report.new_users
         self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
-        self._list = train.usual_list()
-        self.shows_lists = self._list > 1
-        """Whether a decision is a list, whose rules differ less than single items do."""
+        self.list_size = train.usual_list()
         counts = train.item_counts()
         if problem.validation.has_offers:
             # What is new in the validation sessions is not in the training ones.
@@ -259,8 +257,8 @@ class RuleSearch:
         """Simulate `n` sessions of each rule that begin as a store's, with draws of its own."""
         scorers = [self.problem.scorer.under(rule) for rule in rules]
         users = users or self.users
-        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules), self._list)
-        actor = _ManyRules(scorers, n, store, seed, self._list)
+        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules), self.list_size)
+        actor = _ManyRules(scorers, n, store, seed, self.list_size)
         live = np.arange(len(rules) * n)
         returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
         decisions = list[IntArray]()
@@ -435,18 +433,16 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     rules that the model cannot distinguish, the one with the most support in the log is taken.
     """
     search, where = RuleSearch(problem), ""
-    if problem.start is None:
+    if (start := problem.start) is None:
         candidates = _search_all(search)
     else:
         where = "; only rules near that of an earlier run"
         more = _NEAR_THE_LOG if search.least_users else ()
-        rules = find_neighbours(problem.start, problem, more)
-        candidates = search.simulate([*dict.fromkeys(rules)])
+        candidates = search.simulate([*dict.fromkeys(find_neighbours(start, problem, more))])
     finalists = candidates
-    if search.users.reward_report.new_users or search.shows_lists:
+    if search.users.reward_report.new_users or search.list_size > 1:
         finalists = search.finalists(candidates, search.best(candidates))
-        again = {finalist.rule for finalist in finalists}
-        candidates = [*(item for item in candidates if item.rule not in again), *finalists]
+        candidates = [*{item.rule: item for item in [*candidates, *finalists]}.values()]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
     chosen = RuleRecord(
@@ -468,11 +464,9 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     plain = [DecisionRule(None, temperature=temperature) for temperature in hottest_first]
     candidates = search.simulate([rule for of in plain for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
-    candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
-    if search.shows_lists:
-        # Without repetition, rules at a low temperature show many items, too.
-        grid = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
-        candidates += search.simulate(_vary(first, **grid))
+    # Rules of lists show many items at a low temperature, too: no list repeats an item.
+    grid = {"temperature": config.temperatures} if search.list_size > 1 else {}
+    candidates += search.simulate(_vary(first, reward_weight=config.reward_weights, **grid))
     second = search.best(candidates).rule
     if search.users.session_end_report.kept != "constant":
         # More than randomness ends sessions.

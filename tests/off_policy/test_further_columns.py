@@ -54,6 +54,18 @@ def test_groups_are_read_from_feature_tables(trained: TrainedPolicy, file: Path)
     np.testing.assert_array_equal(names, np.array(["a", "b", "c"])[items % 3])
 
 
+def test_a_measure_of_other_rows_is_refused(trained: TrainedPolicy, file: Path) -> None:
+    frame = pd.read_parquet(file)
+    frame["dwell"] = frame.dwell.where(frame.index != frame.index[0])
+    frame["reward"] = frame.reward.where(frame.index != frame.index[1])
+    frame.to_parquet(file)
+    with (
+        pytest.raises(InputError, match="not the same"),
+        read_logged_sessions(trained, [file], LogMapping(), measures=["dwell"]),
+    ):
+        pass
+
+
 @pytest.mark.parametrize(
     ("by", "says"),
     [
@@ -76,11 +88,14 @@ def test_the_command_says_what_it_needs(
     folder: Path, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = str(folder / "run")
-    options = ["--guardrail", "dwell >= -2%", "--by", "country", "--temperature", "1"]
+    options = ["--by", "country", "--temperature", "1"]
+    for bound in ("dwell >= -2%", "dwell <= 9%"):
+        options += ["--guardrail", bound]
     assert main(["ope", run, str(file), *options]) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) <= 15
-    assert any(line.startswith("guardrail dwell: –, at least -2.0%: open (") for line in said)
+    for bound in ("at least -2.0%", "at most +9.0%"):
+        assert any(line.startswith(f"guardrail dwell: –, {bound}: open (") for line in said)
     assert any(line.startswith("DE (") and "users): – (" in line for line in said)
     for more, says in (
         (["--guardrail", "dwell"], "write e.g."),

@@ -14,6 +14,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import bind, engine, explain_errors, text_of_column
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping, log_files
@@ -37,17 +38,18 @@ def read_measure(
     """(N,) values of an expression at the steps of a `store` that was prepared from logs with these
     options; InputError if other rows have one."""
     options = replace(options, reward=Expression(measure, "--guardrail"))
-    folder = store.path.with_name(f"measure-{measure.encode().hex():.99}")
-    with warnings.catch_warnings():
+    with scratch_folder(store.path.parent, "measure") as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore", InputNote)
-        prepare(files, mapping, folder, options, run, keep_unknown)
-    values = EpisodeStore.open(folder)
-    if values.n_steps != store.n_steps:
-        raise InputError(
-            f"{files[0]}: --guardrail {measure} has a value in {values.n_steps:,} rows, the reward "
-            f"in {store.n_steps:,}; give a default, such as coalesce({measure}, 0)"
-        )
-    return values.column(schema.REWARD).astype(np.float64)
+        prepare(files, mapping, scratch / "store", options, run, keep_unknown)
+        values = EpisodeStore.open(scratch / "store")
+        rows = (schema.ITEM, schema.TIMESTAMP)
+        if not all(np.array_equal(values.column(row), store.column(row)) for row in rows):
+            raise InputError(
+                f"{files[0]}: --guardrail {measure} has a value in {values.n_steps:,} rows, the "
+                f"reward in {store.n_steps:,}, which are not the same; give a default, such as "
+                f"coalesce({measure}, 0)"
+            )
+        return values.column(schema.REWARD).astype(np.float64)
 
 
 def read_groups(

@@ -141,7 +141,7 @@ def read_logged_sessions(
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         values = {
             measure: read_measure(files, mapping, options, run, keep_unknown, measure, store)
-            for measure in measures
+            for measure in dict.fromkeys(measures)
         }
         groups = None
         if by is not None:

@@ -1,6 +1,7 @@
 """Measures and groups are those of the rows that are evaluated."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -54,32 +55,23 @@ def test_groups_are_read_from_feature_tables(trained: TrainedPolicy, file: Path)
     np.testing.assert_array_equal(names, np.array(["a", "b", "c"])[items % 3])
 
 
-def test_a_measure_of_other_rows_is_refused(trained: TrainedPolicy, file: Path) -> None:
-    frame = pd.read_parquet(file)
-    frame["dwell"] = frame.dwell.where(frame.index != frame.index[0])
-    frame["reward"] = frame.reward.where(frame.index != frame.index[1])
-    frame.to_parquet(file)
-    with (
-        pytest.raises(InputError, match="not the same"),
-        read_logged_sessions(trained, [file], LogMapping(), measures=["dwell"]),
-    ):
-        pass
-
-
 @pytest.mark.parametrize(
-    ("by", "says"),
+    ("given", "says"),
     [
-        ("reward", "have several values"),
-        ("item_id", "values in these"),
-        ("price", "no column 'pri"),
+        ({"by": "reward"}, "have several values"),
+        ({"by": "item_id"}, "values in these"),
+        ({"by": "price"}, "no column 'pri"),
+        ({"measures": ["nullif(dwell, 0.5)"]}, "not the same"),
     ],
 )
-def test_columns_that_do_not_group_are_refused(
-    trained: TrainedPolicy, file: Path, by: str, says: str
+def test_columns_that_do_not_fit_are_refused(
+    trained: TrainedPolicy, file: Path, given: dict[str, Any], says: str
 ) -> None:
+    frame = pd.read_parquet(file)
+    frame.assign(reward=frame.reward.where(frame.dwell != 1.5)).to_parquet(file)
     with (
         pytest.raises(InputError, match=says),
-        read_logged_sessions(trained, [file], LogMapping(), by=by),
+        read_logged_sessions(trained, [file], LogMapping(), **given),
     ):
         pass
 
@@ -88,9 +80,8 @@ def test_the_command_says_what_it_needs(
     folder: Path, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = str(folder / "run")
-    options = ["--by", "country", "--temperature", "1"]
-    for bound in ("dwell >= -2%", "dwell <= 9%"):
-        options += ["--guardrail", bound]
+    options = ["--guardrail", "dwell >= -2%", "--by", "country", "--temperature", "1"]
+    options += ["--guardrail", "dwell <= 9%"]
     assert main(["ope", run, str(file), *options]) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) <= 15

@@ -327,15 +327,8 @@ def _fit_faithful(
 def _lengths(band: tuple[float, float], states: Tensor, generator: torch.Generator) -> Tensor:
     """(M, 1) lengths of moves from states (M, S), drawn from the band."""
     low, high = band
-    return (
-        low
-        + (high - low)
-        * torch.rand(
-            len(states),
-            1,
-            generator=generator,
-        )
-    ).to(states.device)
+    shares = torch.rand(len(states), 1, generator=generator)
+    return (low + (high - low) * shares).to(states.device)
 
 
 def _products(matrices: Tensor, vectors: Tensor, rows: list[int]) -> Tensor:

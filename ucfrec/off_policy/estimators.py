@@ -297,11 +297,7 @@ def resample(
     # How often each cluster is drawn stands for the resampled rows; as floats, some at a time.
     counts = np.array_split(_draw_counts(clusters, seed), max(1, clusters // _CLUSTERS_AT_ONCE))
     sums = np.concatenate([times.astype(np.float64) @ moments for times in counts])
-    e, b, ee, eb, bb = sums.reshape(
-        -1,
-        5,
-        len(value),
-    ).swapaxes(0, 1)
+    e, b, ee, eb, bb = sums.reshape(-1, 5, len(value)).swapaxes(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(b > 0, e / b, np.nan)
         spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)

@@ -151,12 +151,8 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
             excluded[name] = "; ".join(report.verdict.reasons)
     if not terms:
         return Selection((), math.nan, math.nan, excluded)
-    ranked = select(
-        [*terms],
-        np.stack([*terms.values()], axis=1),
-        seed,
-        reports[first].user,
-    )
+    values = np.stack([*terms.values()], axis=1)
+    ranked = select([*terms], values, seed, reports[first].user)
     return replace(ranked, excluded=excluded)
 
 

@@ -471,21 +471,11 @@ class StackedStreams:
         """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""
         layer, (_, batch, length, dim) = self._policy.attention, tokens.shape
         heads, size = layer.heads, dim // layer.heads
-        query = layer.query(layer.norm(tokens[1, :, -1])).view(
-            batch,
-            heads,
-            1,
-            size,
-        )
+        last = layer.norm(tokens[1, :, -1])
+        query = layer.query(last).view(batch, heads, 1, size)
         both = layer.key_value(layer.norm(tokens)).view(3, batch, length, 2, heads, size)
-        key, value = both.permute(
-            3,
-            1,
-            4,
-            0,
-            2,
-            5,
-        ).reshape(2, batch, heads, -1, size)
+        both = both.permute(3, 1, 4, 0, 2, 5)
+        key, value = both.reshape(2, batch, heads, -1, size)
         scores = query @ key.transpose(-2, -1) / size**0.5  # (B, H, 1, 3K)
         hidden = ~mask.repeat(1, 3)
         # Its own action comes after s_t.

@@ -299,14 +299,8 @@ def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: floa
         ours = tensor.numpy()
         differ = ours != theirs  # −∞ does not differ from itself
         ours, theirs = ours[differ], theirs[differ]
-        apart = np.abs(ours - theirs) / np.maximum(
-            size,
-            np.where(
-                np.isinf(ours),
-                size,
-                abs(ours),
-            ),
-        )
+        sizes = np.where(np.isinf(ours), size, abs(ours))
+        apart = np.abs(ours - theirs) / np.maximum(size, sizes)
         largest = float(np.maximum(largest, apart.max(initial=0.0)))
     if not largest <= TOLERANCE:
         raise InputError(

@@ -165,10 +165,7 @@ HUGE = {"shape": (10**13,), "chunks": (1024,), "compression": "gzip", "dtype": "
         (lambda f, _: f.update(rewards=h5py.SoftLink("/actions")), "a link to another name"),
         (lambda f, o: f.create_dataset("rewards", 14, "f4", external=[(o, 0, 56)]), ELSEWHERE),
         (lambda f, o: f.create_virtual_dataset("rewards", virtual(o)), ELSEWHERE),
-        (
-            lambda f, _: f.create_dataset("rewards", **HUGE),
-            "claims the shape .* only 0 bytes",
-        ),
+        (lambda f, _: f.create_dataset("rewards", **HUGE), "claims the shape .* only 0 bytes"),
         (lambda f, _: f.create_group("rewards"), "rewards is a group"),
         (lambda f, _: f.update(rewards=np.zeros((14, 1, 1), "f4")), "not 1 or 2 dimensions"),
         (lambda f, _: f.update(rewards=["a\nb"] * 14), "not numbers"),

@@ -7,12 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.result_rows import distractor_rows, result_row
-from ucfrec.benchmark.tables import (
-    difference_table,
-    distractor_table,
-    method_table,
-    score_table,
-)
+from ucfrec.benchmark.tables import difference_table, distractor_table, method_table, score_table
 from ucfrec.results.rows import ResultRow
 
 

@@ -5,15 +5,7 @@ from pathlib import Path
 import pytest
 
 from ucfrec.commands.cli import main
-from ucfrec.commands.demo import (
-    BEHAVIORS,
-    ENVIRONMENTS,
-    FULL,
-    SHARED,
-    DemoConfig,
-    conclusion,
-    demo,
-)
+from ucfrec.commands.demo import BEHAVIORS, ENVIRONMENTS, FULL, SHARED, DemoConfig, conclusion, demo
 from ucfrec.results.rows import read_results
 
 TINY = DemoConfig(

@@ -14,11 +14,7 @@ import pytest
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import item_table
-from ucfrec.files.parquet import (
-    read_ids,
-    require_plausible_rows,
-    write_frames,
-)
+from ucfrec.files.parquet import read_ids, require_plausible_rows, write_frames
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare

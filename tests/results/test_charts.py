@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 from tests.support.report_page import HOSTILE
-from ucfrec.results.charts import (
-    Chart,
-    Interval,
-    interval_chart,
-    line_chart,
-    save,
-)
+from ucfrec.results.charts import Chart, Interval, interval_chart, line_chart, save
 
 COLORS = ("ink", "soft", "rule", "paper", "c0", "c1")
 VALUES = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: round(x, 4))

@@ -13,12 +13,7 @@ from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.session_end import (
-    LoggedEnds,
-    SessionEnd,
-    describe_steps,
-    whole_sessions,
-)
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, describe_steps, whole_sessions
 
 ITEMS = 12
 LIKENESS = Likeness.of(ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0.0, 1.0))

@@ -8,12 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
-from ucfrec.commands.shared_options import (
-    LogOptions,
-    RuleOptions,
-    RunArgument,
-    find_runs,
-)
+from ucfrec.commands.shared_options import LogOptions, RuleOptions, RunArgument, find_runs
 from ucfrec.errors import InputError
 from ucfrec.files.remote import origin
 

@@ -248,8 +248,6 @@ class Compare(Table):
         from ucfrec.recommending.responder import parse_split
 
         arms = self.arms.split(",") if self.arms else None
-        if self.expected is not None and not self.expected > 0:
-            raise InputError(f"--expected is {self.expected}; give a difference above 0")
         shares = parse_split(self.shares) if self.shares else None
         result = compare_arms(
             self.logs,

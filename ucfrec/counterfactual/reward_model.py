@@ -20,14 +20,7 @@ from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_weights
 from ucfrec.fitting.loop import Fit, LoopConfig, fit, load_trained
 from ucfrec.processes import random_state_kept
-from ucfrec.settings import (
-    BatchSize,
-    LearningRate,
-    Weight,
-    WeightDecay,
-    Width,
-    settings_table,
-)
+from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width, settings_table
 
 _LOG_2PI = math.log(2 * math.pi)
 INITIAL: Final = "initial.safetensors"

@@ -20,6 +20,7 @@ from ucfrec.logs.tables import first_and_more, is_number, open_tables
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 from ucfrec.off_policy.guardrails import GroupDifference, Guardrail
 from ucfrec.results.evidence import Evidence
+from ucfrec.settings import require
 
 MISS: Final = 0.05
 """Probability with which an interval misses the difference."""
@@ -200,12 +201,14 @@ def compare_arms(
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
             with two users each.
     """
+    fault = f"expected is {expected}; give a difference above 0, and below {_LARGEST:g}"
+    require(expected is None or 1 / _LARGEST < expected < _LARGEST, fault)
     files = log_files(paths)
     name = first_and_more(files)
     groups = _sum_by_user(files, column, memory_limit)
     by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
-    if len(names) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
+    if len({*names}) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
         present = ", ".join(f"{arm!r} ({len(rows):,} users)" for arm, rows in valued.items())
         raise InputError(
             f"{name}: two arms with two users each who have a value of {column} are needed, the "
@@ -213,24 +216,20 @@ def compare_arms(
             "--arms A,B"
         )
     first, second = names
-    if shares is not None and not {first, second} <= shares.keys():
-        raise InputError(f"{name}: shares are given of {', '.join(shares)}; the arms are {names}")
+    if shares is not None and not all(shares.get(arm, 0) > 0 for arm in names):
+        raise InputError(f"{name}: shares are {shares}; give one above 0 to each arm of {names}")
     of_first, of_second = (1.0 if shares is None else shares[arm] for arm in names)
     share, in_arm = of_first / (of_first + of_second), (len(by_arm[first]), len(by_arm[second]))
     means = _Means.of([valued[arm] for arm in names])
-    without_value = [int(by_arm[arm]["rows"].sum() - valued[arm]["shown"].sum()) for arm in names]
-    if any(without_value):
-        warn_user(
-            f"{name}: {column} has no value in {without_value[0]:,} rows of {first} and "
-            f"{without_value[1]:,} of {second}, which are left out; write 0 where it is meant"
-        )
+    without_value = _count_missing(name, column, names, by_arm)
     reasons = _doubt_split(in_arm, share)
     planned, always = means.compare(expected, reasons)
     results = []
     for guardrail in map(Guardrail.parse, guardrails):
-        values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))[1]
+        all_rows, values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))
         if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
+        _count_missing(name, guardrail.measure, names, all_rows)
         results.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
     differences: list[GroupDifference] = []
     if by is not None:
@@ -245,7 +244,7 @@ def compare_arms(
         in_arm=in_arm,
         shares=(share, 1 - share),
         rows=means.rows,
-        without_value=(without_value[0], without_value[1]),
+        without_value=without_value,
         without_user=int(groups["rows"][~groups["who"]].sum()),
         without_arm=int(groups["rows"][groups["who"] & (groups[schema.ARM] == "")].sum()),
         in_several=len(mixed),
@@ -255,6 +254,19 @@ def compare_arms(
         guardrails=tuple(results),
         groups=tuple(differences),
     )
+
+
+def _count_missing(
+    name: str, measure: str, arms: Sequence[str], by_arm: Mapping[str, pd.DataFrame]
+) -> tuple[int, int]:
+    """Rows of two arms without a value, which a note tells of."""
+    first, second = (int((by_arm[arm]["rows"] - by_arm[arm]["shown"]).sum()) for arm in arms)
+    if first or second:
+        warn_user(
+            f"{name}: {measure} has no value in {first:,} rows of {arms[0]} and {second:,} of "
+            f"{arms[1]}, which are left out; write 0 where it is meant"
+        )
+    return first, second
 
 
 def _compare_parts(

@@ -10,6 +10,7 @@ import numpy as np
 from ucfrec.off_policy.estimators import (
     LOGGED,
     NO_INTERVAL,
+    TOO_EVEN,
     Estimate,
     cluster_intervals,
     cluster_mean,
@@ -101,7 +102,7 @@ def plan_test(steps: LoggedSteps, lift: float, days: float | None) -> ABTest | N
     return as in the logs; None where they do not differ, or nothing is to be found."""
     users = len(np.unique(steps.users))
     error = cluster_mean(steps.returns, steps.users)[1]
-    if lift <= 0 or error <= 0:
+    if lift <= 0 or not 0 < error < 1e6 * lift:
         return None
     # A half of the traffic has twice the variance, and so has their difference.
     size = (2 * _DETECTED * error / lift) ** 2
@@ -280,7 +281,7 @@ def conclude(
         value, ones = float(lifts.mean()), np.ones((len(lifts), 1))
         (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
         if interval is None:
-            reasons.append("the sessions do not differ enough for an interval")
+            reasons.append(TOO_EVEN)
     low, high, _, better = interval or NO_INTERVAL
     return Verdict(
         lift=Evidence(value, low, high, tuple(reasons)),

@@ -74,9 +74,9 @@ class Terms:
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     """Mean return per session as logged, and under the evaluated policy; `seed` draws resamples.
 
-    DM, FQE and the doubly robust need `steps.model`; all that
-    weigh leave out sessions with a step of unknown propensity, which is right where propensities
-    are lost at random, and are omitted where no session has any weight.
+    DM, FQE and the doubly robust need `steps.model`; all that weigh leave out sessions with a step
+    of unknown propensity, which is right where propensities are lost at random, and are omitted
+    where no session has any weight.
     """
     ones = np.ones(len(steps.first))
     terms = {LOGGED: Terms(steps.returns, ones, ones)}
@@ -154,12 +154,8 @@ def normalise_by_step(
     Args:
         left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
     """
-    weights, step, sessions, totals = (
-        steps.weights,
-        steps.step,
-        len(steps.first),
-        steps.step_totals(),
-    )
+    weights, step = steps.weights, steps.step
+    sessions, totals = len(steps.first), steps.step_totals()
     by_step = steps.discount ** np.arange(len(totals))
     rewarded = by_step * np.bincount(step, weights * left) / totals
     mine = steps.discounts * weights * left / totals[step]
@@ -202,6 +198,8 @@ class Interval(NamedTuple):
 
 
 NO_INTERVAL: Final = (None, None, None, None)
+TOO_EVEN: Final = "the sessions do not differ enough for an interval"
+NO_SPREAD: Final = Evidence(None, None, None, (TOO_EVEN,))
 
 
 def cluster_intervals(
@@ -240,13 +238,17 @@ def cluster_intervals(
 
 def simultaneous_intervals(
     above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
-) -> list[tuple[float, float, float]]:
-    """Ratios as of `cluster_intervals`, each with the ends of intervals that hold all of them at
-    once with 95% probability (max-t: Romano & Wolf, Econometrica 2005)."""
+) -> list[Evidence]:
+    """Ratios as of `cluster_intervals`, with intervals that hold all of them at once with 95%
+    probability (max-t: Romano & Wolf, Econometrica 2005)."""
     resamples = resample(above, below, cluster, seed)
     half = find_critical(np.abs(resamples.studentised)) * resamples.error
+    usable = np.isfinite(resamples.studentised).mean(axis=0) >= _USABLE
     ends = np.stack([resamples.value, resamples.value - half, resamples.value + half], axis=1)
-    return [(float(value), float(low), float(high)) for value, low, high in ends]
+    return [
+        Evidence(value, low, high) if enough else NO_SPREAD
+        for (value, low, high), enough in zip(ends.tolist(), usable, strict=True)
+    ]
 
 
 def find_critical(deviations: Float64Array) -> float:

@@ -265,7 +265,7 @@ def _make_report(
         )
     warnings = [*verdict.reasons, *logs.remarks]
     judged = logs.columns | diagnosis.list_columns() | verdict.list_columns()
-    judged |= {"warnings": warnings}
+    judged["warnings"] = warnings
     record = trained.record
     base = ResultRow(
         suite=SUITE,
@@ -358,14 +358,14 @@ def _add_evidence(
 ) -> tuple[Verdict, Float64Array | None]:
     """The verdict with what else was asked for, and (S,) whose mean is the estimate that it is of;
     where that is not reliable, what single steps show, and what would let the logs say more."""
-    rows, traffic, terms = logs.steps, logs.traffic, None
+    rows, way, traffic, terms = logs.steps, steps.positions, logs.traffic, None
     if verdict.estimator is not None:
         terms = session_terms(steps.weighable)[verdict.estimator].influences
         if logs.groups is not None:
             lifts = terms - steps.weighable.returns
-            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed))
+            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed, way))
     guardrails = [
-        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
+        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed, way)
         for text, measure in zip(options.guardrails, options.measures, strict=True)
     ]
     verdict = replace(verdict, guardrails=guardrails)

@@ -9,11 +9,12 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import (
+    TOO_EVEN,
     cluster_intervals,
     estimate_by_step,
     simultaneous_intervals,
 )
-from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.logged_steps import LoggedSteps, Positions, merge_lists
 from ucfrec.off_policy.verdict import diagnose, list_reasons
 from ucfrec.results.evidence import UNMEASURED, Evidence
 from ucfrec.settings import require
@@ -81,14 +82,27 @@ class GroupDifference:
         return f"{self.name} ({self.users:,} users): {self.difference.format()}{why}"
 
 
+def _weigh(steps: LoggedSteps, rewards: Float64Array, positions: Positions) -> LoggedSteps:
+    """The sessions that can be weighed, with other rewards (N,), by an assumption on lists."""
+    steps = replace(steps, reward=rewards, model=None)
+    return (merge_lists(steps) if positions == "whole list" else steps).weighable
+
+
 def check_guardrail(
-    text: str, values: Float64Array, steps: LoggedSteps, reasons: Sequence[str], seed: int
+    text: str,
+    values: Float64Array,
+    steps: LoggedSteps,
+    reasons: Sequence[str],
+    seed: int,
+    positions: Positions = "cascade",
 ) -> Guardrail:
     """What weights show of a measure with values (N,), by SNPDIS; nothing if `reasons` speak
-    against them."""
+    against them, or too few users have the measure."""
     guardrail, ends, value = Guardrail.parse(text), None, None
     if not reasons:
-        measured = replace(steps, reward=values, model=None).weighable
+        measured = _weigh(steps, values, positions)
+        reasons = list_reasons(diagnose(measured))
+    if not reasons:
         logged = measured.returns
         changes = estimate_by_step(measured) - logged
         if logged.sum() <= 0:
@@ -96,22 +110,26 @@ def check_guardrail(
         else:
             value = float(changes.sum() / logged.sum())
             (ends,) = cluster_intervals(changes[:, None], logged[:, None], measured.user, seed)
-            reasons = [] if ends else ["the sessions do not differ enough for an interval"]
+            reasons = [] if ends else [TOO_EVEN]
     low, high = (ends.low, ends.high) if ends else (None, None)
     return replace(guardrail, change=Evidence(value, low, high, tuple(reasons)))
 
 
 def compare_groups(
-    groups: Groups, steps: LoggedSteps, lifts: Float64Array, seed: int
+    groups: Groups,
+    steps: LoggedSteps,
+    lifts: Float64Array,
+    seed: int,
+    positions: Positions = "cascade",
 ) -> list[GroupDifference]:
     """The lifts (S,) of sessions with weights by group of users; or, by SNPDIS, by the group of
     items that returns come from. Intervals of groups whose weights stand hold at once."""
-    differences, weighable = list[GroupDifference](), steps.weighable
+    differences, weighable = list[GroupDifference](), _weigh(steps, steps.reward, positions)
     terms = dict[int, Float64Array]()
     for number, name in enumerate(groups.names):
         if groups.of_items:
             rewards = np.where(groups.number == number, steps.reward, 0.0)
-            part = replace(steps, reward=rewards, model=None).weighable
+            part = _weigh(steps, rewards, positions)
             above, inside = estimate_by_step(part) - part.returns, np.ones(len(lifts), dtype=bool)
         else:
             inside = groups.number[steps.first][~steps.lacking] == number
@@ -127,7 +145,6 @@ def compare_groups(
     if terms:
         aboves, belows = np.stack([*terms.values()], axis=2)
         ends = simultaneous_intervals(aboves, belows, weighable.user, seed)
-        for number, (value, low, high) in zip(terms, ends, strict=True):
-            evidence = Evidence(value, low, high)
+        for number, evidence in zip(terms, ends, strict=True):
             differences[number] = replace(differences[number], difference=evidence)
     return differences

@@ -108,12 +108,10 @@ class LoggedSteps:
             raise InputError("sessions are numbered from 0 in order, and there is at least one")
         replace_field("session", session.astype(np.int64, copy=False))
         n = len(session)
-        for name in _COLUMNS:
-            if (values := getattr(self, name)) is not None:
-                if name in _PROBABILITIES:
-                    replace_field(name, _check_probabilities(name, values, self.densities))
-                else:
-                    replace_field(name, _require_finite(name, values))
+        replace_field("reward", _require_finite("reward", self.reward))
+        for name in _PROBABILITIES:
+            values = getattr(self, name)
+            replace_field(name, _check_probabilities(name, values, self.densities))
         if self.user is not None:
             replace_field("user", _number_users(self.user))
         columns = [(name, getattr(self, name)) for name in (*_COLUMNS, "place")]
@@ -319,13 +317,7 @@ def merge_lists(steps: LoggedSteps) -> LoggedSteps:
     those of the positions. Models of the return are those of the first position; those of the
     reward are summed."""
     starts = np.flatnonzero(np.diff(steps.decision, prepend=-1))
-
-    def multiply(values: Float64Array) -> Float64Array:
-        return np.asarray(np.multiply.reduceat(values, starts))
-
-    def add(values: Float64Array) -> Float64Array:
-        return np.asarray(np.add.reduceat(values, starts))
-
+    add, multiply = (partial(of.reduceat, indices=starts) for of in (np.add, np.multiply))
     model = steps.model and Modelled(
         reward=add(steps.model.reward),
         q=steps.model.q[starts],

@@ -66,11 +66,12 @@ def read_findings(paths: Sequence[Path]) -> list[Finding]:
     kinds = grouped(rows, lambda row: row.suite == SUITE and row.metric in ("R_cum", _STEP))
     measured = kinds.get(False, ())
     tables = grouped(measured, lambda row: (row.table, row.environment or row.task, row.metric))
-    return [
-        *_conclude_estimates(kinds.get(True, ())),
-        *(_conclude_rows(f"{key[0]}, {key[1]}", group) for key, group in tables.items()),
-        *findings,
-    ]
+    with damage_explained(", ".join(map(str, paths)), "write the result rows again"):
+        return [
+            *_conclude_estimates(kinds.get(True, ())),
+            *(_conclude_rows(f"{key[0]}, {key[1]}", group) for key, group in tables.items()),
+            *findings,
+        ]
 
 
 def _conclude_estimates(rows: Sequence[ResultRow]) -> list[Finding]:
@@ -103,7 +104,7 @@ def _conclude_estimates(rows: Sequence[ResultRow]) -> list[Finding]:
             for key in ("guardrails", "groups")
             if row.details.get(key)
         ]
-        warnings = row.details.get("warnings", ())
+        warnings = [*map(str, row.details.get("warnings", ()))]
         findings.append(Finding(name, answer, tables, warnings, parts=parts))
     return findings
 

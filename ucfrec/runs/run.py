@@ -19,11 +19,7 @@ from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem, RuleRecord
-from ucfrec.counterfactual.augmentation import (
-    MODELS,
-    AugmentationReport,
-    augment_episodes,
-)
+from ucfrec.counterfactual.augmentation import MODELS, AugmentationReport, augment_episodes
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import (
@@ -43,13 +39,7 @@ from ucfrec.processes import phase, random_state_kept
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.record import (
-    CANDIDATES,
-    RUN,
-    RunRecord,
-    place_of,
-    read_augmentation,
-)
+from ucfrec.runs.record import CANDIDATES, RUN, RunRecord, place_of, read_augmentation
 from ucfrec.runs.start import (
     begin,
     new_policy,

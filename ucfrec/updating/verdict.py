@@ -141,7 +141,7 @@ def _compare(
     (interval,) = cluster_intervals(above[:, None], below[:, None], user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high
-    elif value and not reasons:
+    elif above.any() and not reasons:
         reasons = ["the users do not differ enough"]
     return Evidence(value, low, high, tuple(reasons))
 

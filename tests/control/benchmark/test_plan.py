@@ -18,14 +18,7 @@ from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
-from ucfrec_control.benchmark.methods import (
-    EQUAL_TIME,
-    MAIN,
-    METHODS,
-    PAPER,
-    PURSUING,
-    TABLES,
-)
+from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
 from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store

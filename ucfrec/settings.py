@@ -182,7 +182,7 @@ def _number(value: float) -> str:
 
 Check = Callable[[str, Any], Any]
 """Takes the name of an argument and its value, and returns the value to use in its place."""
-LARGEST_SEED: Final = 2**32 - 1
+LARGEST_SEED = 2**32 - 1
 """scikit-learn accepts no larger one."""
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")

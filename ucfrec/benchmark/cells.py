@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.simulator import Environment
@@ -15,10 +15,10 @@ from ucfrec.runs.config import Config, resolve_config
 
 Presets = Mapping[str, Mapping[str, Any]]
 """Defaults of settings, by table."""
-PAPER_UCF: Final = "ucf-paper"
+PAPER_UCF = "ucf-paper"
 """What the names of methods with the paper's settings begin with; a budget shortens their training,
 and changes nothing else (`Budget.shorten`)."""
-UPDATES: Final = "updates"
+UPDATES = "updates"
 """Detail of their rows: in words, how much of its training they had."""
 
 

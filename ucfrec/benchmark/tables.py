@@ -2,17 +2,16 @@
 method."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
 
 from ucfrec.benchmark.cells import PAPER_UCF, UPDATES
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
-DISTRACTOR_RATES: Final = {"no distractor": None, "distractor off": 0.0, "distractor on": 1.0}
+DISTRACTOR_RATES = {"no distractor": None, "distractor off": 0.0, "distractor on": 1.0}
 """Probability that the distractor is on in an evaluation; None: an environment without one."""
-OURS: Final = "ucf"
-NEAR: Final = 0.05
+OURS = "ucf"
+NEAR = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
 BySeed = Mapping[tuple[int | None, int | None], float]
 """Values by the seeds of the log and of the training."""

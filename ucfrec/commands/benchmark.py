@@ -5,7 +5,7 @@ import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Group, Table, settings_given
 from ucfrec.commands.shared_options import RuleOptions
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ucfrec.benchmark.suite import Benchmark as Suite
     from ucfrec.evaluation.simulator import Environment
 
-ROWS_REMEDY: Final = "measure its rows again, or name another file with --results"
+ROWS_REMEDY = "measure its rows again, or name another file with --results"
 _LOGS = Group("logs and seeds")
 
 

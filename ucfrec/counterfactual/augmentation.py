@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -39,9 +39,9 @@ from ucfrec.files.record import Undefinable
 from ucfrec.processes import random_state_kept
 from ucfrec.settings import Count, Quantile, settings_table
 
-CRM: Final = "crm"
+CRM = "crm"
 """Folder of the reward model."""
-MODELS: Final = (CRM, "csg")
+MODELS = (CRM, "csg")
 """Folders of the checkpoints of `augment_episodes`, as far as the settings need them."""
 _CPU = torch.device("cpu")
 _CHUNK, _ACTION_CHUNK = 8192, 4096

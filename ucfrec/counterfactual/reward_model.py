@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from ucfrec.processes import random_state_kept
 from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width, settings_table
 
 _LOG_2PI = math.log(2 * math.pi)
-INITIAL: Final = "initial.safetensors"
+INITIAL = "initial.safetensors"
 """Weights of an older reward model, in the folder of the new one."""
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1

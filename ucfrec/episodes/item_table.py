@@ -3,7 +3,6 @@
 import json
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from safetensors import SafetensorError
@@ -13,19 +12,19 @@ from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 
-ITEM_STATES: Final = "item_states.safetensors"
+ITEM_STATES = "item_states.safetensors"
 """Name of the file in a store or a run."""
-OFFERS: Final = "offers.safetensors"
+OFFERS = "offers.safetensors"
 """Name of the file of `Offers` in a store or a run; missing where everything is always on offer."""
-ALWAYS: Final = -(2**62), 2**62
+ALWAYS = -(2**62), 2**62
 """Begin and end, in ms, of an interval without bounds."""
-DISTINCT_TAGS: Final = 1000
+DISTINCT_TAGS = 1000
 """Most tags of a catalogue that are distinguished; rarer ones are excluded."""
-TAGS_PER_ITEM: Final = 16
+TAGS_PER_ITEM = 16
 """Most tags that one item keeps."""
-WINDOW: Final = 10
+WINDOW = 10
 """Number of most recent steps that enter the means of a state."""
-DECAY: Final = 0.8
+DECAY = 0.8
 """Factor by which the weight in the means falls with each step back."""
 
 

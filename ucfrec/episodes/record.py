@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
@@ -14,7 +14,7 @@ from ucfrec.files.record import Count, Entry, Number, Record, Text
 
 Milliseconds = Annotated[int, Field(strict=True, ge=-62_135_596_800_000, lt=253_402_300_800_000)]
 """Since the Unix epoch, in the years 1 to 9999."""
-LONG: Final = 100
+LONG = 100
 """Times the median from which on a session is hardly a person's."""
 _Positive = Annotated[int, Field(strict=True, ge=1, lt=2**48)]
 _Width = Annotated[int, Field(strict=True, ge=1, le=2**24)]

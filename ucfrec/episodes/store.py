@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ITEM_STATES", "EpisodeStore"]
 
-LONGEST_HISTORY: Final = 1000
+LONGEST_HISTORY = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 _STATISTICS_STEPS = 100_000
 _FILES = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}

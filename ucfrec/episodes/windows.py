@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
 
-AUGMENTED: Final = "augmented.safetensors"
+AUGMENTED = "augmented.safetensors"
 """Name of the file of a run."""
 
 

@@ -1,7 +1,7 @@
 """Simulate a behavior policy in a simulator and write its sessions as Parquet logs."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,13 +18,13 @@ from ucfrec.processes import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
-EPOCH_MS: Final = 1_704_067_200_000
+EPOCH_MS = 1_704_067_200_000
 """Start of the first session, 2024-01-01 00:00 UTC, in ms."""
-SESSION_MS: Final = 60_000
+SESSION_MS = 60_000
 """Between the starts of two sessions."""
-STEP_MS: Final = 1_000
+STEP_MS = 1_000
 """Between two steps of a session."""
-ROWS_PER_GROUP: Final = 65_536
+ROWS_PER_GROUP = 65_536
 """Rows of a Parquet row group, at least, but for the last."""
 
 

@@ -3,7 +3,7 @@ novelty of the items recommended (EasyRL4Rec)."""
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,13 +24,13 @@ from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-SUITE: Final = "evaluate"
+SUITE = "evaluate"
 """Suite of the rows."""
-SIDE_BY_SIDE: Final = 512
+SIDE_BY_SIDE = 512
 """Largest number of episodes simulated in parallel."""
-TAGS: Final = "tags"
+TAGS = "tags"
 """Catalogue column with the list of each item's tags."""
-ONE_HOT: Final = "tag_"
+ONE_HOT = "tag_"
 """Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
 Recommended = Sequence[tuple[IntArray, IntArray]]
 """Episode and item of every live episode, step by step."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from operator import add, attrgetter
 from pathlib import Path
-from typing import Any, Final, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -18,16 +18,16 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_file
 from ucfrec.schema import ITEM_ID, USER_IDS
 
-REWARD: Final = "reward"
+REWARD = "reward"
 """Column of the environment's rewards in logs."""
 
 Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 """Reads the item table from an environment and its number of items."""
 _Observed = tuple[tuple[str | None, spaces.Space[Any]], ...]
 """Spaces that are observed and their keys in the dict observation; None for all of it."""
-FEATURES: Final = "features"
+FEATURES = "features"
 """Column of the item table with an array's numbers."""
-TAGS: Final = "tags"
+TAGS = "tags"
 """Column of the item table with the numbers of an array's true columns."""
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,9 +47,9 @@ from ucfrec.results.rows import ResultRow
 from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-SUITE: Final = "rank"
+SUITE = "rank"
 """Suite of the rows."""
-METRIC: Final = "hit_rate_liked"
+METRIC = "hit_rate_liked"
 _OTHERWISE = "hit_rate_shown"
 """Metric of rows on logs in which nothing is liked."""
 _KNN_HISTORY = 20

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Simulator:
         return "mixture" if "mixture" in self.behaviors else "random"
 
 
-GYMNASIUM: Final = "gymnasium:"
+GYMNASIUM = "gymnasium:"
 """Start of the names of environments that are Gymnasium environments."""
 
 

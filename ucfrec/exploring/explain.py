@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ from ucfrec.logs.histories import Histories
 from ucfrec.recommending.recommend import SCORE, recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-PARTS: Final = ("policy", "exposure", "reward weight", "lookahead")
+PARTS = ("policy", "exposure", "reward weight", "lookahead")
 _ALMOST_NONE = 1e-9
 """A lookahead that changes no score, but has rewards counted in the units of a lookahead."""
 _EXCLUDED = 10

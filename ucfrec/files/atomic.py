@@ -16,15 +16,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import xxhash
 from filelock import BaseFileLock, FileLock, Timeout
 
 from ucfrec.errors import InputError
 
-LOCK: Final = ".ucfrec-lock"
-SCRATCH: Final = ".ucfrec-partial"
+LOCK = ".ucfrec-lock"
+SCRATCH = ".ucfrec-partial"
 _CHECKSUM = "checksum"
 """Entry of a JSON object with the checksum of its other entries."""
 _PATIENCE = 0.5

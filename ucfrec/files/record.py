@@ -33,11 +33,11 @@ from ucfrec.files.atomic import LOCK, SCRATCH, read_json, write_json
 
 CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
-RUN_RECORD: Final = "run.json"
+RUN_RECORD = "run.json"
 """Record of a run."""
 _THREADS = 2
 _LARGEST = 2**48
-SMALL: Final = 2**26
+SMALL = 2**26
 """Bytes of a file that is always read to check it."""
 Text = InstanceOf[str]
 """A text; unlike pydantic's own, file names may have bytes that are not valid Unicode."""

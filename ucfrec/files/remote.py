@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
@@ -25,7 +25,7 @@ _URI = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://.+")
 _BLOCK = 2**22
 _SPARE = 0.9
 """Share of the free disk that copies may take."""
-RECORDS: Final = ("meta.json", "run.json")
+RECORDS = ("meta.json", "run.json")
 """Files that make a folder a store or a run; they are copied last."""
 
 _origins: dict[str, str] = {}

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
 from pydantic import Field, TypeAdapter
@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text, require_file
 
-REMEDY: Final = "restore it or train again"
+REMEDY = "restore it or train again"
 """What to do about a damaged file."""
-METRICS: Final = "metrics.jsonl"
+METRICS = "metrics.jsonl"
 _STEP = "step"
 _LARGEST_STEP = 2**53
 """The largest range of integers that floats represent exactly."""

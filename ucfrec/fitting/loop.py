@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -97,7 +97,7 @@ class Callbacks:
     `loss`, `gradient_norm`, …"""
 
 
-SILENT: Final = Callbacks()
+SILENT = Callbacks()
 
 
 @random_state_kept()

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +35,7 @@ from ucfrec.logs.summary import note_unknown
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import progress
 
-SPLIT: Final = (0.6, 0.2, 0.2)
+SPLIT = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
 _FILL = {
     schema.PROPENSITY: np.nan,

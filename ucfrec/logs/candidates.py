@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import duckdb
 import numpy as np
@@ -18,7 +17,7 @@ from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import KEY_OF_LIST, TypedLog
 
-ITEMS: Final = "items"
+ITEMS = "items"
 """Column of a table of sets: the ids in a set, whose name is in the column `candidates`."""
 
 _SETS = (

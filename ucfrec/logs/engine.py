@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import duckdb
 import numpy as np
@@ -37,7 +37,7 @@ from ucfrec.settings import nearest
 if TYPE_CHECKING:
     import pyarrow as pa
 
-BATCH_ROWS: Final = 2**17
+BATCH_ROWS = 2**17
 """Most rows of a batch read from DuckDB."""
 _BESIDE = 370 * 2**20
 """Bytes that going through rows takes beside the engine and what the process has already."""

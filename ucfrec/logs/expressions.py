@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Collection, Iterator
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from ucfrec import schema
 from ucfrec.errors import InputError
@@ -17,13 +17,13 @@ from ucfrec.errors import InputError
 if TYPE_CHECKING:
     import duckdb
 
-MAX_LENGTH: Final = 4000
+MAX_LENGTH = 4000
 """Most characters of an expression."""
-MAX_NESTING: Final = 100
+MAX_NESTING = 100
 """Most nested levels of an expression: brackets, calls, operators."""
-MAX_GROWTH: Final = 500
+MAX_GROWTH = 500
 """Most times by which text of an expression may be longer than the text of its columns."""
-MAX_SIZE: Final = 20_000
+MAX_SIZE = 20_000
 """Most nodes of an expression as DuckDB evaluates it, counting each copy of copied arguments."""
 _MAX_TREE = 2_000_000
 """Most characters of the JSON of a syntax tree."""
@@ -40,7 +40,7 @@ _SCALARS = """
     DOUBLE DECIMAL VARCHAR TEXT STRING BPCHAR NVARCHAR UUID GUID JSON DATE TIME INTERVAL DATETIME
     TIMESTAMP TIMESTAMP_S TIMESTAMP_MS TIMESTAMP_US TIMESTAMP_NS TIMESTAMPTZ
 """
-TYPES: Final = frozenset(_SCALARS.split()) | {"TIMESTAMP WITH TIME ZONE", "LIST"}
+TYPES = frozenset(_SCALARS.split()) | {"TIMESTAMP WITH TIME ZONE", "LIST"}
 """Types that a cast may name, as the parser writes them; LIST is one of the others with []."""
 
 # No function here reads files, settings, the clock or a random number, returns several rows, or
@@ -79,9 +79,9 @@ _OPERATORS = """
     + - * / // % ^ ** || & | << >> ~ xor @ ^@ @> <@ && ->>
     ~~ !~~ ~~* !~~* ~~~ like_escape not_like_escape ilike_escape not_ilike_escape
 """
-FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATORS)).split())
+FUNCTIONS = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATORS)).split())
 """Allowed functions, and operators by the parser's names (~~ is LIKE)."""
-COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
+COPYING = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
 """Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
 _JOINING = ("concat", "||", "list_concat", "list_cat", "list_append", "list_prepend")
 """What they return is as long as all their arguments together."""

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import duckdb
 import numpy as np
@@ -45,9 +45,9 @@ _KINDS = {
     "VARCHAR[]": "tags",
     "FLOAT[]": "vectors",
 }
-CATEGORIES: Final = 200
+CATEGORIES = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
-CLIP: Final = 5.0
+CLIP = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 _TIMES = ("available_from", "available_until")
 _MANY_LACKING = 0.2

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 from tempfile import gettempdir
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from ucfrec.episodes.item_table import IdLookup
 
-HISTORIES: Final = "histories"
+HISTORIES = "histories"
 """Name of a data frame in messages and in the engine."""
 _UNREAD = (
     pa.types.is_float16,

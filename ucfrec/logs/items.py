@@ -6,7 +6,7 @@ same space: old rows stay where they are.
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Final
+from typing import IO
 
 import numpy as np
 from scipy import sparse
@@ -21,17 +21,17 @@ from ucfrec.logs.rows import keep_users_whole
 from ucfrec.logs.sessions import Moments
 from ucfrec.processes import require_blas_memory
 
-PRIOR_COUNT: Final = 3.0
+PRIOR_COUNT = 3.0
 """Number of times shown at which co-occurrence and features have equal weight for an item."""
-RIDGE: Final = 1.0
+RIDGE = 1.0
 """L2 penalty of the regression of co-occurrence embeddings on features."""
-CONTENT_RANK: Final = 64
+CONTENT_RANK = 64
 """Most feature dimensions in that regression."""
-USER_SIZE: Final = 32
+USER_SIZE = 32
 """Most dimensions of the user features."""
-BLOCK_STEPS: Final = 2**19
+BLOCK_STEPS = 2**19
 """Training steps in memory at a time, or more if one user has more."""
-EXPOSURE: Final = 0.25
+EXPOSURE = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
 _OVERSAMPLES = 10
 _SMALL = 1e-10

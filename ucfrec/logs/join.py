@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Final
 
 import duckdb
 
@@ -27,7 +26,7 @@ from ucfrec.logs.tables import (
 )
 from ucfrec.logs.typed import WANTED, LogTables, type_columns
 
-FEEDBACK: Final = "feedback"
+FEEDBACK = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
 _REQUEST = schema.REQUEST_ID
 _KEYS = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)

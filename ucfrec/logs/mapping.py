@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, get_args
+from typing import Any, get_args
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
@@ -17,15 +17,15 @@ from ucfrec.files.remote import RECORDS
 from ucfrec.logs.expressions import Expression
 from ucfrec.settings import nearest
 
-SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
+SUFFIXES = (".parquet", ".csv", ".csv.gz")
 _OTHER_TABLES = (
     *(".tsv", ".pq", ".jsonl", ".ndjson", ".orc", ".avro", ".feather", ".arrow", ".xlsx"),
     *(".csv.bz2", ".csv.zip", ".csv.zst", ".csv.xz", ".tar.gz", ".zip"),
 )
 """Endings of files beside logs that may be meant to be read."""
 _CONVERT = "convert it to Parquet or CSV, or give it one of the endings that are read"
-KEY_COLUMNS: Final = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
-OPTIONAL_COLUMNS: Final = (
+KEY_COLUMNS = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
+OPTIONAL_COLUMNS = (
     schema.OBSERVATION,
     schema.PROPENSITY,
     schema.SESSION_ID,
@@ -36,11 +36,11 @@ OPTIONAL_COLUMNS: Final = (
     schema.EXCLUDES_SEEN,
     schema.CANDIDATES,
 )
-SETS_SUFFIX: Final = ".candidates.parquet"
+SETS_SUFFIX = ".candidates.parquet"
 """Ending of the file of sets of candidates that lies beside exposures and logs of `join`."""
-EARLIEST_MS: Final = 946_684_800_000
+EARLIEST_MS = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
-SESSIONS: Final = get_args(schema.SessionBy)
+SESSIONS = get_args(schema.SessionBy)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,28 +32,28 @@ USER, ITEM, SESSION, CANDIDATE_SET = "user_code", "item_code", "session", "candi
 """Columns of the sorted rows: numbers of the ids, in the order of the ids."""
 _REQUEST = "request"
 """Column of a hash of the request."""
-CODES: Final = {
+CODES = {
     schema.USER_ID: ("user_codes", USER),
     schema.ITEM_ID: ("item_codes", ITEM),
     schema.SESSION_ID: ("session_codes", SESSION),
     schema.CANDIDATES: ("candidate_codes", CANDIDATE_SET),
 }
 """Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
-FAULTY: Final = "faulty"
+FAULTY = "faulty"
 """View of all rows, as of `mark_faults`."""
-HELD: Final = "held"
+HELD = "held"
 """Relation of rows that a store has already."""
-FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
-PRIME: Final = 2**31 - 1
-USER_FACTOR: Final = 7919
-HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
+FAULT_COUNTS = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
+PRIME = 2**31 - 1
+USER_FACTOR = 7919
+HASH = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
 """SQL of `hash_ids`, for Spark and, where `conv` is a macro, for DuckDB."""
-TIE: Final = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME})"
+TIE = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME})"
 """SQL of the place of a row among those of one user and time, by the hash of the user, the time and
 the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
 two items are as often in one order as in the other."""
-DAY_MS: Final = 86_400_000
-REASONS: Final = {
+DAY_MS = 86_400_000
+REASONS = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
     "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "

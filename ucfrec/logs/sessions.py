@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,19 +28,19 @@ from ucfrec.processes import Progress
 if TYPE_CHECKING:
     from ucfrec.episodes.offers import Offers
 
-FEW_VALUES: Final = 20
+FEW_VALUES = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""
-EPISODES: Final = "episodes"
+EPISODES = "episodes"
 """Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
 `begins_session` and `terminated`."""
 USED_USERS, USED_ITEMS = "used_users", "used_items"
 """Tables of the users and items in the steps: id, `code`, `steps` and `train_count` (those of the
 training split); of users `longest`, the steps of their longest episode, and `ended`, whether their
 last one is terminated."""
-ITEMS_FILE: Final = "items.parquet"
-USERS_FILE: Final = "users.parquet"
-EPISODE_USERS: Final = "episode_users.parquet"
-ID_TABLES: Final = ((schema.USER_ID, "users", USERS_FILE), (schema.ITEM_ID, "items", ITEMS_FILE))
+ITEMS_FILE = "items.parquet"
+USERS_FILE = "users.parquet"
+EPISODE_USERS = "episode_users.parquet"
+ID_TABLES = ((schema.USER_ID, "users", USERS_FILE), (schema.ITEM_ID, "items", ITEMS_FILE))
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
 _BINS = 2**16
 _NEIGHBOURS = slice(None, -1), slice(1, None)

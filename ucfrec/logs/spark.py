@@ -22,7 +22,7 @@ from itertools import chain
 from math import ceil
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -58,9 +58,9 @@ from ucfrec.logs.typed import (
     type_columns,
 )
 
-MEMORY: Final = "2GB"
+MEMORY = "2GB"
 """Memory of the process of a task."""
-PART_ROWS: Final = 1_000_000
+PART_ROWS = 1_000_000
 """About so many rows are a part; a user's rows are never in two."""
 _TYPES = {
     "BIGINT": "bigint",

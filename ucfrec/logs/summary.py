@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -30,14 +30,14 @@ from ucfrec.logs.sessions import (
 from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
-SAMPLE_ROWS: Final = 100_000
+SAMPLE_ROWS = 100_000
 """Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
 used whole."""
-QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
-MANY: Final = 0.2
+QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+MANY = 0.2
 """Share of the rows from which on what happens to them is worth a warning."""
-FEW_IDS: Final = 20
-MOST_UNKNOWN: Final = 0.9
+FEW_IDS = 20
+MOST_UNKNOWN = 0.9
 """Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
 warning that they are unknown."""
 _NAMED = 5

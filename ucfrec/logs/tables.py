@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Final, TextIO, cast
+from typing import TextIO, cast
 
 import duckdb
 import pyarrow as pa
@@ -39,16 +39,16 @@ _MOST_NESTED = 32
 """Most levels of a Parquet column; a list is two, and DuckDB's time doubles with each list."""
 _NESTED_TOO_DEEP = "schema too deeply nested"
 """Arrow's words."""
-NOTHING: Final = '"NULL"'
+NOTHING = '"NULL"'
 """DuckDB type of a column without any value."""
-ISO_TIME: Final = (
+ISO_TIME = (
     r"\d{4}[-/]\d{1,2}[-/]\d{1,2}"
     r"([T ]\d{1,2}:\d{1,2}(:\d{1,2}([.,]\d+)?)?\s*(Z|UTC|[+-]\d{2}(:?\d{2})?)?)?"
 )
 """Times that have one meaning: the year comes first."""
-EXPOSED: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
+EXPOSED = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
 """Columns that together only exposures have, and logs that `join` made of them."""
-PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
+PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 """Column in which pandas keeps the numbers of the rows of a frame: no data."""
 _NO_VALUE = "__HIVE_DEFAULT_PARTITION__"
 """Value of a column in the name of a folder whose rows have none."""
@@ -56,7 +56,7 @@ _FILE = "ucfrec: file"
 _RAW = "ucfrec: text of "
 
 MAX_FLOAT = 3.4028235e38
-WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
+WHOLE = {"FLOAT": 2**24, "DOUBLE": 2**53}
 """DuckDB type of reals to the bound below which it holds every whole number."""
 
 

@@ -6,7 +6,7 @@ from collections import namedtuple
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import duckdb
 
@@ -39,11 +39,11 @@ from ucfrec.logs.tables import (
     raw_name,
 )
 
-ROWS: Final = "read"
+ROWS = "read"
 """Relation of `TypedLog`."""
-WANTED: Final = "wanted"
+WANTED = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
-VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
+VECTORS = (schema.ACTION, schema.OBSERVATION)
 _BATCH_BYTES = 2**25
 _IS_INTEGER = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
 """SQL of whether a text `x` is as the integer that it means is written."""
@@ -60,7 +60,7 @@ _TYPES = {
     schema.EXCLUDES_SEEN: "BOOLEAN",
     schema.CANDIDATES: "VARCHAR",
 }
-KEY_OF_LIST: Final = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
+KEY_OF_LIST = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
 """SQL of the name of a set of candidates that is a list in the log."""
 _DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
 _OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
 from tempfile import gettempdir
-from typing import Final
 
 import pandas as pd
 
@@ -22,11 +21,11 @@ from ucfrec.off_policy.guardrails import GroupDifference, Guardrail
 from ucfrec.results.evidence import Evidence
 from ucfrec.settings import require
 
-MISS: Final = 0.05
+MISS = 0.05
 """Probability with which an interval misses the difference."""
-EXPECTED: Final = 0.05
+EXPECTED = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
-MISMATCH: Final = 0.001
+MISMATCH = 0.001
 """Below this p-value, the users were not drawn into the arms by the intended shares."""
 _LARGEST = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""

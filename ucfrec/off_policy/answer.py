@@ -3,14 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from ucfrec.off_policy.estimators import (
     LOGGED,
     NO_INTERVAL,
-    TOO_EVEN,
+    NO_SPREAD,
     Estimate,
     cluster_intervals,
     cluster_mean,
@@ -28,11 +28,11 @@ from ucfrec.off_policy.verdict import (
 )
 from ucfrec.results.evidence import Evidence
 
-DAY_MS: Final = 86_400_000
+DAY_MS = 86_400_000
 Answer: TypeAlias = Literal["launch", "test it", "do not launch", "the log cannot say"]
-BEST_FIRST: Final = ("DR", "SNPDIS")
+BEST_FIRST = ("DR", "SNPDIS")
 """The estimator that a verdict is about: the first of these that there is."""
-MOST_LINES: Final = 15
+MOST_LINES = 15
 """Lines of an answer."""
 _DETECTED = 1.96 + 0.84
 """Standard errors in a lift that 80% of samples would find at 95% confidence."""
@@ -281,7 +281,7 @@ def conclude(
         value, ones = float(lifts.mean()), np.ones((len(lifts), 1))
         (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
         if interval is None:
-            reasons.append(TOO_EVEN)
+            reasons += NO_SPREAD.reasons
     low, high, _, better = interval or NO_INTERVAL
     return Verdict(
         lift=Evidence(value, low, high, tuple(reasons)),

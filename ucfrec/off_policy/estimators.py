@@ -22,7 +22,7 @@ step, as if it went on without reward (Thomas & Brunskill 2016).
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,9 +32,9 @@ from ucfrec.off_policy.logged_steps import LoggedSteps, number_clusters
 from ucfrec.results.evidence import Evidence
 from ucfrec.results.statistics import effective_number
 
-SUITE: Final = "off-policy"
+SUITE = "off-policy"
 """Suite of the result rows."""
-LOGGED: Final = "logged"
+LOGGED = "logged"
 _OF_MODEL = "only as good as its model, whose error no resampling shows"
 
 
@@ -197,9 +197,8 @@ class Interval(NamedTuple):
     """Share of resamples in which the number is above 0."""
 
 
-NO_INTERVAL: Final = (None, None, None, None)
-TOO_EVEN: Final = "the sessions do not differ enough for an interval"
-NO_SPREAD: Final = Evidence(None, None, None, (TOO_EVEN,))
+NO_INTERVAL = (None, None, None, None)
+NO_SPREAD = Evidence(None, None, None, ("the sessions do not differ enough for an interval",))
 
 
 def cluster_intervals(

@@ -292,6 +292,7 @@ def _make_report(
         rule=rule.hash,
         **provenance(),
     )
+    per_step = replace(base, table="per step", metric="R_step")
     return OffPolicyReport(
         rows=_make_rows(base, estimates, rule, judged),
         warnings=warnings,
@@ -300,9 +301,7 @@ def _make_report(
         returns=np.empty(0) if weighable is None else weighable.returns,
         user=None if weighable is None else weighable.user,
         terms=terms,
-        step_rows=_make_rows(
-            replace(base, table="per step", metric="R_step"), of_steps, rule, judged
-        ),
+        step_rows=_make_rows(per_step, of_steps, rule, judged),
     )
 
 
@@ -358,20 +357,20 @@ def _add_evidence(
 ) -> tuple[Verdict, Float64Array | None]:
     """The verdict with what else was asked for, and (S,) whose mean is the estimate that it is of;
     where that is not reliable, what single steps show, and what would let the logs say more."""
-    rows, way, traffic, terms = logs.steps, steps.positions, logs.traffic, None
+    rows, terms = replace(logs.steps, positions=steps.positions), None
     if verdict.estimator is not None:
         terms = session_terms(steps.weighable)[verdict.estimator].influences
         if logs.groups is not None:
             lifts = terms - steps.weighable.returns
-            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed, way))
+            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed))
     guardrails = [
-        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed, way)
+        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
         for text, measure in zip(options.guardrails, options.measures, strict=True)
     ]
     verdict = replace(verdict, guardrails=guardrails)
     if verdict.lift.is_reliable:
         return verdict, terms
-    plans = [traffic.plan_more(diagnosis) or traffic.plan_exploration(), logs.nearby]
+    plans = [logs.traffic.plan_more(diagnosis) or logs.traffic.plan_exploration(), logs.nearby]
     verdict = replace(verdict, remedies=[] if logs.forbidden else [*filter(None, plans)])
     if (single := cut_to_steps(rows)) is not None:
         verdict = replace(verdict, per_step=conclude(single, seed, forbidden=logs.forbidden))
@@ -409,9 +408,8 @@ def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions) -> None:
     logs.forbidden += seen_too_often(seen)
     if seen is None:
         logs.remarks.append(
-            "the store that the run was trained on is gone or has changed: whether these logs were "
-            "seen in training is not known, and users begin without a history; move the run "
-            "together with its store"
+            "the store of the run is gone or has changed: whether these logs were seen in training "
+            "is not known, and users begin without a history; move the run together with its store"
         )
     if logged.unknown_items:
         logs.remarks.append(
@@ -455,11 +453,9 @@ def collect_steps(
         discount=options.discount,
     )
     if len(np.unique(plain.users)) < 2:
-        sessions = len(plain.first)
         raise InputError(
-            f"{logged.report.get('files', [store.path])[0]}: the logs have {sessions:,} "
-            f"session{'s' * (sessions > 1)} of one user; each user is predicted by models of "
-            "others: give logs of more users"
+            f"{logged.report.get('files', [store.path])[0]}: the logs are of one user; each user "
+            "is predicted by models of others: give logs of more users"
         )
     items = store.column(schema.ITEM).astype(np.int64)
     assert trained.item_states is not None

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import duckdb
 import numpy as np
@@ -23,7 +22,7 @@ from ucfrec.logs.tables import Table, open_tables
 from ucfrec.logs.typed import open_log_tables
 from ucfrec.off_policy.guardrails import Groups
 
-MOST_GROUPS: Final = 20
+MOST_GROUPS = 20
 
 
 def read_measure(

@@ -9,12 +9,12 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import (
-    TOO_EVEN,
+    NO_SPREAD,
     cluster_intervals,
     estimate_by_step,
     simultaneous_intervals,
 )
-from ucfrec.off_policy.logged_steps import LoggedSteps, Positions, merge_lists
+from ucfrec.off_policy.logged_steps import LoggedSteps, merge_lists
 from ucfrec.off_policy.verdict import diagnose, list_reasons
 from ucfrec.results.evidence import UNMEASURED, Evidence
 from ucfrec.settings import require
@@ -82,25 +82,20 @@ class GroupDifference:
         return f"{self.name} ({self.users:,} users): {self.difference.format()}{why}"
 
 
-def _weigh(steps: LoggedSteps, rewards: Float64Array, positions: Positions) -> LoggedSteps:
-    """The sessions that can be weighed, with other rewards (N,), by an assumption on lists."""
+def _weigh(steps: LoggedSteps, rewards: Float64Array) -> LoggedSteps:
+    """The sessions that can be weighed, with other rewards (N,); whole lists merged."""
     steps = replace(steps, reward=rewards, model=None)
-    return (merge_lists(steps) if positions == "whole list" else steps).weighable
+    return (merge_lists(steps) if steps.positions == "whole list" else steps).weighable
 
 
 def check_guardrail(
-    text: str,
-    values: Float64Array,
-    steps: LoggedSteps,
-    reasons: Sequence[str],
-    seed: int,
-    positions: Positions = "cascade",
+    text: str, values: Float64Array, steps: LoggedSteps, reasons: Sequence[str], seed: int
 ) -> Guardrail:
     """What weights show of a measure with values (N,), by SNPDIS; nothing if `reasons` speak
     against them, or too few users have the measure."""
     guardrail, ends, value = Guardrail.parse(text), None, None
     if not reasons:
-        measured = _weigh(steps, values, positions)
+        measured = _weigh(steps, values)
         reasons = list_reasons(diagnose(measured))
     if not reasons:
         logged = measured.returns
@@ -110,26 +105,22 @@ def check_guardrail(
         else:
             value = float(changes.sum() / logged.sum())
             (ends,) = cluster_intervals(changes[:, None], logged[:, None], measured.user, seed)
-            reasons = [] if ends else [TOO_EVEN]
+            reasons = () if ends else NO_SPREAD.reasons
     low, high = (ends.low, ends.high) if ends else (None, None)
     return replace(guardrail, change=Evidence(value, low, high, tuple(reasons)))
 
 
 def compare_groups(
-    groups: Groups,
-    steps: LoggedSteps,
-    lifts: Float64Array,
-    seed: int,
-    positions: Positions = "cascade",
+    groups: Groups, steps: LoggedSteps, lifts: Float64Array, seed: int
 ) -> list[GroupDifference]:
     """The lifts (S,) of sessions with weights by group of users; or, by SNPDIS, by the group of
     items that returns come from. Intervals of groups whose weights stand hold at once."""
-    differences, weighable = list[GroupDifference](), _weigh(steps, steps.reward, positions)
+    differences, weighable = list[GroupDifference](), _weigh(steps, steps.reward)
     terms = dict[int, Float64Array]()
     for number, name in enumerate(groups.names):
         if groups.of_items:
             rewards = np.where(groups.number == number, steps.reward, 0.0)
-            part = _weigh(steps, rewards, positions)
+            part = _weigh(steps, rewards)
             above, inside = estimate_by_step(part) - part.returns, np.ones(len(lifts), dtype=bool)
         else:
             inside = groups.number[steps.first][~steps.lacking] == number
@@ -137,9 +128,8 @@ def compare_groups(
             part = weighable.select(inside) if inside.any() else weighable
         reasons = [] if inside.any() else ["no session can be weighed"]
         reasons += list_reasons(diagnose(part))
-        unknown = Evidence(None, None, None, tuple(reasons))
         users = len(np.unique(weighable.users[inside]))
-        differences.append(GroupDifference(name, users, unknown))
+        differences.append(GroupDifference(name, users, Evidence(None, None, None, tuple(reasons))))
         if not reasons:
             terms[number] = np.stack([above, inside])
     if terms:

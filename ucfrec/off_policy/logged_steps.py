@@ -298,8 +298,7 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
         values = np.where(above, 1.0, values)
     inside = np.isfinite(values) if densities else values <= 1
     outside = ~((values > 0) & inside | np.isnan(values))
-    rule = "propensities must be above 0 and at most 1, the probability of the item shown and not a"
-    rule += " density"
+    rule = "propensities must be above 0 and at most 1, probabilities of the item shown, no density"
     remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
     if name == "target":
         outside = ~((values >= 0) & inside)

@@ -232,7 +232,6 @@ class _GroupModel:
         group: IntArray,
         shares: Float64Array,
     ) -> None:
-        # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler

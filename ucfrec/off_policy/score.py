@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,11 +37,11 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
-MOST_SEEN: Final = 0.05
+MOST_SEEN = 0.05
 """Largest share of rows seen in training with which an estimate is accepted: with coarse timestamps
 rows of other logs may have the same user, item and time."""
 
-HISTORY_LACKING: Final = (
+HISTORY_LACKING = (
     "the store of the run is gone or has changed: users are ranked without what they were shown "
     "before these logs; move the run together with its store"
 )

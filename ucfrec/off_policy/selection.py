@@ -139,9 +139,8 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
         again = reports[name].returns
         if len(again) != len(returns) or not np.allclose(again, returns):
             raise InputError(
-                f"{first} and {name} read these logs as different sessions or rewards (their "
-                "stores were prepared in different ways), so their estimates cannot be compared; "
-                "evaluate them one at a time"
+                f"{first} and {name} read these logs as different sessions or rewards, as their "
+                "stores were prepared in different ways; evaluate them one at a time"
             )
     excluded, terms = dict[str, str](), dict[str, Float64Array]()
     for name, report in reports.items():

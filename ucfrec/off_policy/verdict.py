@@ -8,7 +8,7 @@ ones.
 import math
 from dataclasses import asdict, dataclass
 from statistics import NormalDist
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -17,24 +17,24 @@ from ucfrec.off_policy.estimators import cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
-ENOUGH_TO_TEST: Final = 30
+ENOUGH_TO_TEST = 30
 """Users below which a mean weight is not tested."""
-ENOUGH_USERS: Final = 200
+ENOUGH_USERS = 200
 """Effective users below which no estimate stands (`benchmarks/off_policy_coverage.py`)."""
-ENOUGH_REWARDED: Final = 30
+ENOUGH_REWARDED = 30
 """Users with weight and reward."""
-LEAST_SHOWN: Final = 0.01
+LEAST_SHOWN = 0.01
 """Share of the evaluated policy's choices below which an item group is not tested."""
-DOMINANT: Final = 0.1
+DOMINANT = 0.1
 """Largest share of one user in all weight."""
-HEAVY_TAIL: Final = 0.5
+HEAVY_TAIL = 0.5
 """Pareto shape from which on the variance is infinite, and no interval means anything."""
-FAR_OFF: Final = 0.1
+FAR_OFF = 0.1
 """Distance of a mean session weight from 1 that counts, though no test may show it."""
-MOST_LEFT_OUT: Final = 0.05
+MOST_LEFT_OUT = 0.05
 """Largest share of sessions, or rows, without which an estimate stands."""
 _SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
-SESSION_PRODUCTS: Final = "session products"
+SESSION_PRODUCTS = "session products"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -23,9 +23,9 @@ from ucfrec.settings import settings_table
 from ucfrec.user_model.reward_report import draw_numbers
 from ucfrec.user_model.session_end import LEAVES, TREES, BoostedTrees, fit_trees
 
-PRIOR: Final = 10.0
+PRIOR = 10.0
 """Steps at the mean rate that are added to every item's own."""
-HALF_LIVES: Final = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
+HALF_LIVES = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
 """Hours after which a row counts half; those that are tried."""
 _SMOOTHING = 1.0
 """Likes that are added to all items together."""

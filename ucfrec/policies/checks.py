@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.processes import random_state_kept
 
-RESERVED: Final = frozenset(
+RESERVED = frozenset(
     {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "values", "head"}
     | {"normalize", "imitation", "act_and_features", "max_return", "exposed"}
 )

@@ -10,7 +10,7 @@ a class derived from `ucfrec.policies.base.SequencePolicy`::
 import warnings
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ucfrec.errors import InputError, InputNote
 from ucfrec.plugins import load_plugin, plugin_names, plugin_package
@@ -18,7 +18,7 @@ from ucfrec.plugins import load_plugin, plugin_names, plugin_package
 if TYPE_CHECKING:
     from ucfrec.policies.base import SequencePolicy
 
-BUILT_IN: Final = {
+BUILT_IN = {
     "ucf": "ucf:UCFPolicy",
     "ucf-paper": "ucf:UCFPaperPolicy",
     "dt": "dt:DTPolicy",

@@ -4,7 +4,7 @@ Dropout, attention and convolution cost less here than PyTorch's on a CPU.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -28,7 +28,7 @@ from ucfrec.settings import Share, Weight, settings_table
 
 _FEW = 32
 """Windows up to which calling an operation costs more than its arithmetic."""
-EPSILON: Final = 1e-8
+EPSILON = 1e-8
 """Added inside the logarithm of Eq. 5 (Table 7)."""
 _LEVELS = 2**16
 """Values of the random 16-bit numbers that decide what a CPU drops."""

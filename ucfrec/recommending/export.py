@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,10 +23,10 @@ from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-GRAPH: Final = "model.onnx"
-DESCRIPTION: Final = "model.json"
-OUTPUTS: Final = ("scores", "top_items", "top_scores")
-TOLERANCE: Final = 1e-5
+GRAPH = "model.onnx"
+DESCRIPTION = "model.json"
+OUTPUTS = ("scores", "top_items", "top_scores")
+TOLERANCE = 1e-5
 """Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
 """
 _STATE = ("items", "rewards", "steps", "collected", "users", "observations")

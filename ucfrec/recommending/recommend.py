@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,9 +24,9 @@ from ucfrec.recommending.requests import parse_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, require_whole
 
-RANK: Final = "rank"
-SCORE: Final = "score"
-SIMILAR_ITEM: Final = "similar_item_id"
+RANK = "rank"
+SCORE = "score"
+SIMILAR_ITEM = "similar_item_id"
 _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**23

@@ -8,7 +8,7 @@ from bisect import bisect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -26,10 +26,10 @@ from ucfrec.runs.promoted import POINTER, Promoted, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.schema import SESSION_ID
 
-ONNXRUNTIME: Final = "onnxruntime"
+ONNXRUNTIME = "onnxruntime"
 _LARGEST_EXACT = 2**53 - 1
 """Largest integer that JavaScript holds exactly."""
-SECONDS: Final = 2.0
+SECONDS = 2.0
 """Time between two looks at which run is current."""
 _UNITS = 2**32
 

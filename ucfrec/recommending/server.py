@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -27,7 +27,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.processes import Interrupted, block_ctrl_c, interruptions_raised
 
-METRICS: Final = "PROMETHEUS_MULTIPROC_DIR"
+METRICS = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of the folder in which workers share their metrics."""
 _PAUSE = 10.0
 """Seconds after which a worker that could not start is tried again."""

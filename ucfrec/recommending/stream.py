@@ -2,7 +2,7 @@
 
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator, Sequence
-from typing import IO, Any, Final
+from typing import IO, Any
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
@@ -10,7 +10,7 @@ from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Request, Row, StreamRequest, parse
 from ucfrec.recommending.responder import Responder, exact_id
 
-REMEMBERED: Final = 1_000_000
+REMEMBERED = 1_000_000
 """Rows that a stream keeps; the least recently active users are dropped first."""
 _BLOCK = 2**16
 _AT_ONCE = 256

@@ -153,8 +153,7 @@ def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
 
 def _conclude_comparison(test: Comparison) -> Finding:
     """What an A/B test says."""
-    evidence = {"as planned": test.planned, "whenever looked at": test.always}
-    intervals = _list_intervals(evidence)
+    intervals = _list_intervals({"as planned": test.planned, "whenever looked at": test.always})
     first, second = test.arms
     title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
     chart = interval_chart(title, intervals, ("no difference", 0.0))

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 import pyarrow.parquet as pq
@@ -21,7 +21,7 @@ from ucfrec.runs.trained_policy import ITEMS
 
 Curves = Mapping[str, Mapping[int, float]]
 """{name: {step: value}}, as from `ucfrec.fitting.checkpoint.read_metrics`."""
-POINTS: Final = 200
+POINTS = 200
 """Most points of a drawn curve."""
 _TITLES = {
     "validation_loss": "Validation loss (action, held-out steps)",

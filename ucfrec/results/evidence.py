@@ -1,7 +1,7 @@
 """What measurements say, and the reasons not to rely on them."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 Relation: TypeAlias = Literal["better", "worse", "level", "open"]
 
@@ -44,4 +44,4 @@ class Evidence:
         return f"{self.value:{number}} [{self.low:{number}}, {self.high:{number}}]"
 
 
-UNMEASURED: Final = Evidence(None, None, None)
+UNMEASURED = Evidence(None, None, None)

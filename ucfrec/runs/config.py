@@ -28,7 +28,7 @@ from ucfrec.settings import (
     shown,
 )
 
-TABLES: Final = ("policy", "train", "crm", "csg", "augment", "rule")
+TABLES = ("policy", "train", "crm", "csg", "augment", "rule")
 _KINDS: Final[tuple[Any, ...]] = (LoopConfig, CRMConfig, CSGConfig, AugmentConfig, RuleConfig)
 
 

@@ -4,7 +4,7 @@ The file names the current run and those before it, the latest last.
 """
 
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
@@ -12,7 +12,7 @@ from ucfrec.files.record import Record, Text
 from ucfrec.runs.record import RunRecord, verify_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-POINTER: Final = "promoted.json"
+POINTER = "promoted.json"
 
 
 class Promoted(Record):

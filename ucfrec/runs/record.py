@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -36,12 +36,12 @@ from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 
 _Report = TypeVar("_Report")
-RUN: Final = RUN_RECORD
-REFIT: Final = "refit"
+RUN = RUN_RECORD
+REFIT = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
-STORE_SUFFIX: Final = "-store"
+STORE_SUFFIX = "-store"
 """Added to the name of a run, it is the default name of its own store beside it."""
-CANDIDATES: Final = "candidates.json"
+CANDIDATES = "candidates.json"
 """File of the decision rules that the choice tried."""
 
 

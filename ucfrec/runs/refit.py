@@ -3,7 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -15,7 +15,7 @@ from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 from ucfrec.user_model.session_end import SESSIONS
 
-SHARE: Final = 0.25
+SHARE = 0.25
 """Steps of a refit, as a share of those that the best weights took."""
 
 

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ from ucfrec.runs.trained_policy import (
 )
 from ucfrec.user_model.model import UserModel
 
-SAMPLES: Final = "samples.json"
+SAMPLES = "samples.json"
 _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 

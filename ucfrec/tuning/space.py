@@ -13,7 +13,7 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import TABLES, Config, resolve_config
 
-POLICY: Final = "policy"
+POLICY = "policy"
 """Name of the choice among policies; settings have a dot."""
 Value = bool | int | float | str
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import optuna
@@ -36,8 +36,8 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
-VALUE: Final = "value"
-METRICS: Final = {
+VALUE = "value"
+METRICS = {
     VALUE: "return of a session in the user model, under the decision rule that training selects",
     "ndcg": "NDCG of liked items among the k recommended, on validation rows",
     "gauc": "probability that a liked item scores above another one shown to the user, on "

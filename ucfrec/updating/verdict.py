@@ -1,7 +1,7 @@
 """Whether an updated run is better than the one before, on rows that neither was trained on."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,8 @@ from ucfrec.user_model.reward_report import (
     score_rows,
 )
 
-RANKING: Final = "ndcg_liked"
-VALUE: Final = "reward per step"
+RANKING = "ndcg_liked"
+VALUE = "reward per step"
 _K = 10
 
 
@@ -150,7 +150,7 @@ _GROUPS = 10
 _PRIOR = 0.5
 """Added to every count, so that no group is empty."""
 _MOST_STEPS = 100_000
-LARGE: Final = 0.25
+LARGE = 0.25
 """Population stability index from which on a distribution counts as another one; below 0.1 it
 counts as the same (Siddiqi, Credit Risk Scorecards, 2006)."""
 

@@ -1,7 +1,6 @@
 """Main tags of items, and fatigue: users reward less once they liked one many times in a row."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
 
-LONGEST: Final = 8
+LONGEST = 8
 """Largest length of a run, and largest number of steps that it lasts, that are tried."""
 _MOST = 0.5
 """Largest factor that counts as fatigue."""

@@ -1,7 +1,7 @@
 """Expected reward of every item of a catalogue: additive effects of items, users and the state."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,17 +12,17 @@ from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.running import AGES, RunningRates
 
-MEMORY: Final = 50
+MEMORY = 50
 """Steps of a session that show tastes, the latest ones."""
 _LEAST = 1e-6
 """Variance of tastes in every direction, relative to the mean."""
-FITTED: Final = "item_reward.safetensors"
+FITTED = "item_reward.safetensors"
 """File of a fitted model in its folder."""
-LAGS: Final = 10
+LAGS = 10
 """Items shown before a step whose repetition and likeness enter its expected reward."""
 _AT_ONCE = 8192
 """Items that are compared to what was shown before them at once."""
-CLIP: Final = 5.0
+CLIP = 5.0
 """Standardised states beyond this many standard deviations are clipped."""
 
 

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
-EFFECTS: Final = (
+EFFECTS = (
     *("running", "item", "user", "content", "affinity", "tastes", "exposure"),
     *("context", "state", "interaction"),
 )
@@ -36,7 +36,7 @@ _SMALLEST = 1e-6
 _SPREADS = tuple(0.05 * 2 ** (k / 2) for k in range(13))
 _FIRST = 6
 """Index of the spread that is tried first, 0.4."""
-CHEAP: Final = ("item", "user", "content")
+CHEAP = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
 _STRIDES = {**dict.fromkeys(CHEAP, (2, 1)), "tastes": ()}
 """Steps of the search of a spread, (2,) for others; one number alone needs no search."""
@@ -44,7 +44,7 @@ _LEAST_KNOWN = 0.1
 """Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
-LASTING: Final = ("running", "item", "user", "content", "affinity")
+LASTING = ("running", "item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
 _ITEMS = ("running", "item", "content")
 """Effects of items alone."""

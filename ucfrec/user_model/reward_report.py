@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Final
 
 import numpy as np
 import pydantic
@@ -25,7 +24,7 @@ _LARGEST_WEIGHT = 10.0
 """Larger weights are cut off, so that no single row decides."""
 _FEWEST = 50
 """Rows of a half from which on a line is fitted to it."""
-SAVED: Final = ConfigDict(extra="forbid")
+SAVED = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
 Line = tuple[float, float]
 

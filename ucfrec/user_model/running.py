@@ -19,9 +19,9 @@ from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 
 _HOUR_MS: Final = 3_600_000
-HALF_LIVES: Final = (6.0, 24.0, 96.0, math.inf)
+HALF_LIVES = (6.0, 24.0, 96.0, math.inf)
 """Hours after which a row counts half, one rate each."""
-AGES: Final = 2
+AGES = 2
 """Inputs of an item's age: in days, and the logarithm of its hours and 1."""
 _PRIOR: Final = 20.0
 """Rows with the mean reward that are added to those of an item."""

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pydantic
@@ -21,7 +20,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
 from ucfrec.user_model.reward_report import draw_numbers, mean_gain
 
-SESSIONS: Final = "sessions.safetensors"
+SESSIONS = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
 _PENALTY = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
@@ -39,8 +38,8 @@ _STEP = 2.0**-10
 """Likeness is rounded to multiples of this, so that torch and onnxruntime agree on thresholds."""
 _HIGHEST = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
-TREES: Final = 100
-LEAVES: Final = 8
+TREES = 100
+LEAVES = 8
 """Most trees, and leaves of a tree."""
 _SETTINGS = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
 _SPLITS = LEAVES - 1

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chisquare
 
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.off_policy.ab_test import Comparison, always_valid, compare_arms, find_split_p_value
 
 
@@ -189,6 +189,9 @@ def test_guardrails_and_groups_are_compared(tmp_path: Path) -> None:
         assert found.guardrails[0].outcome == outcome
         assert found.guardrails[0].change.low < -0.1 < found.guardrails[0].change.high
         assert found.conclusion == says
+    frame.assign(dwell=frame.dwell.where(frame.index % 9 > 0)).to_parquet(file)
+    with pytest.warns(InputNote, match="dwell has no value in .* rows of a and"):
+        compare("dwell >= -20%")
     mismatched = compare_arms([file], guardrails=["dwell >= -20%"], by="device")
     assert "guardrail dwell: –, at least -20.0%: open (sample" in str(mismatched)
     assert all("–" in str(group) for group in mismatched.groups)
@@ -226,5 +229,10 @@ def test_arms_that_lack_users_conclude_nothing(tmp_path: Path) -> None:
     for users in (120, 145, 160):
         expected = chisquare([users, 100]).pvalue
         assert find_split_p_value((users, 100), 0.5) == pytest.approx(expected)
-    with pytest.raises(InputError, match="shares are given of a, c; the arms are"):
-        compare_arms([file], shares={"a": 0.5, "c": 0.5})
+    for given, says in (
+        *(({"shares": {"a": 0.0, arm: 0.5}}, "give one above 0 to each arm of") for arm in "bc"),
+        *(({"expected": wrong}, "give a difference above 0") for wrong in (-1.0, 1e-200, 1e200)),
+        ({"arms": ["a", "a"]}, "two arms"),
+    ):
+        with pytest.raises(InputError, match=says):
+            compare_arms([file], **given)

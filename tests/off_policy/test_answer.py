@@ -60,7 +60,8 @@ def test_a_planned_test_finds_the_lift_four_times_in_five() -> None:
         error = np.sqrt((means.var(axis=1) / means.shape[1]).sum())
         found += means[1].mean() - means[0].mean() > 1.96 * error
     assert 140 <= found <= 180
-    assert plan_test(replace(steps, reward=0 * returns), 0.05, 3) is None
+    for lift, factor in ((0.05, 0), (1e-170, 1), (0.05, 1e160)):
+        assert plan_test(replace(steps, reward=factor * returns), lift, 3) is None
 
 
 @pytest.mark.parametrize("users", [300, 3000])

@@ -14,10 +14,12 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import (
     LOGGED,
     MOST_CLUSTERS,
+    NO_SPREAD,
     cluster_intervals,
     cluster_mean,
     estimate,
     session_terms,
+    simultaneous_intervals,
 )
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 
@@ -312,6 +314,7 @@ def test_where_nothing_spreads_there_is_no_interval() -> None:
     ones = np.ones((50, 1))
     for values in (np.zeros(50), np.ones(50), np.eye(1, 50)[0]):
         assert cluster_intervals(column(values), ones, None, 0) == [None]
+        assert simultaneous_intervals(column(values), ones, None, 0) == [NO_SPREAD]
     one_user = np.zeros(50, dtype=np.int64)
     assert cluster_intervals(column(np.arange(50)), ones, one_user, 0) == [None]
 

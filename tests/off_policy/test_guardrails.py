@@ -1,10 +1,13 @@
 """Guardrails hold, break or stay open by their interval; intervals of groups hold at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.off_policy.test_verdict import ITEMS, TARGET, logs
 from ucfrec.errors import InputError
+from ucfrec.off_policy import LoggedSteps, merge_lists
 from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
 
 DWELL = np.linspace(2.0, 1.0, ITEMS)
@@ -33,6 +36,32 @@ def test_a_guardrail_is_checked_by_the_interval_of_the_change(text: str, outcome
     assert doubted.outcome == "open"
     assert "dwell: –" in str(doubted)
     assert "not above 0" in str(check_guardrail(text, -DWELL[items], steps, (), 0))
+
+
+def test_a_measure_of_few_users_leaves_a_guardrail_open() -> None:
+    """Of complaints that only one item had, all have one weight: an interval would be too tight."""
+    steps, items = logs(4000)
+    rare = ((items == 2) & (np.cumsum(items == 2) < 10)) * 1.0
+    guardrail = check_guardrail("complaints <= 5%", rare, steps, (), 0)
+    assert guardrail.outcome == "open"
+    assert "only 9 users have both weight and reward" in str(guardrail)
+
+
+def test_lists_are_weighed_by_the_assumption_of_the_verdict() -> None:
+    """Dwell at the first position depends on the item below it: only whole lists show its loss."""
+    rng = np.random.default_rng(0)
+    liked = rng.random((6000, 2)) < 0.5
+    rewards, target = liked.ravel() + rng.normal(size=12_000), np.where(liked, 0.8, 0.2).ravel()
+    session, place = np.divmod(np.arange(12_000), 2)
+    steps = LoggedSteps(session, rewards, np.full(12_000, 0.5), target, place=place)
+    whole = replace(steps, positions="whole list")
+    dwell = np.stack([np.where(liked[:, 1], 0.2, 1.0), np.zeros(6000)], axis=1).ravel()
+    lifts = merge_lists(steps).session_weights * steps.returns - steps.returns
+    few = Groups(("all", "few"), (session >= 5670).astype(int), False)
+    for given, outcome, enough in ((steps, "holds", True), (whole, "broken", False)):
+        assert check_guardrail("d >= -2%", dwell, given, (), 0).outcome == outcome
+        (_, small) = compare_groups(few, given, lifts, 0)
+        assert small.difference.is_reliable == enough
 
 
 @pytest.mark.parametrize("text", ["dwell", "dwell >= -2", ">= -2%", "dwell > -2%"])

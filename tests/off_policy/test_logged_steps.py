@@ -105,7 +105,7 @@ def few_others(values: Any, other: Any) -> Any:
         ({"user": few_others(USER, np.nan)}, "users are missing, or"),
         ({"user": USER[1:]}, "user has 59 values for 60 sessions"),
         ({"propensity": few_others(ONES, 0)}, "propensities must be above 0 .* 2 of 120 are"),
-        ({"propensity": few_others(ONES, 1.5)}, "not a density; .* the first is 1.5"),
+        ({"propensity": few_others(ONES, 1.5)}, "no density; .* the first is 1.5"),
         ({"target": few_others(ONES, 1.1)}, r"between 0 and 1; 2 of 120 are outside, .* 1\.1$"),
         ({"discount": 0.0}, "above 0 and at most 1"),
         ({"groups": ItemGroups(USER, ONES[:, None])}, "number has 60 values for 120 steps"),

@@ -434,7 +434,7 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     r"options is {'discount': 0\.9}; give EstimateOptions": (
         lambda p, log: p.ope(log, options={"discount": 0.9})
     ),
-    "^data: the logs have 1 session of one user": lambda p, log: p.ope(log[log.user_id == 7]),
+    "^data: the logs are of one user": lambda p, log: p.ope(log[log.user_id == 7]),
     "others has 'run'; give a Rec": lambda p, log: p.rank(log, others=["run"]),
     "candidates is empty or nested; give a list of item_ids, or None for all": (
         lambda p, log: p.recommend(log, candidates=[[1], [2, 3]])

@@ -144,5 +144,8 @@ def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> Non
     assert (others.answer, others.tables[0].rows) == (
         "", [("dropped", ["3"]), ("verdict", ["no effect"])]
     )  # fmt: skip
-    with pytest.raises(InputError, match="is damaged"):
-        findings_of(tmp_path, {"always": 1})
+    rows = [{"guardrails": part} for part in ("abc", [1], [{}], [{"m": 1, "change": {"low": 1}}])]
+    rows += [{"warnings": 5}, {"intervals": {"R_cum": [1]}}, {"decision_rule": "abc"}]
+    for content in ({"always": 1}, *(call(4.0, True, **details) for details in rows)):
+        with pytest.raises(InputError, match="is damaged"):
+            findings_of(tmp_path, content, call(1.0, True))

@@ -95,9 +95,7 @@ def test_logs_hold_propensities_and_tags(tmp_path: Path) -> None:
         assert np.flatnonzero(topics).tolist() == tags.tolist()
 
 
-def test_other_environments_and_missing_packages_are_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_other_environments_and_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="serves SARDINE, not SyntheticCatalog"):
         GreedyOracle(SyntheticCatalog(2), 0)
     monkeypatch.setattr(sardine, "PACKAGE", "sardine_that_is_not_installed")

@@ -84,7 +84,8 @@ HOUR, LIFE, DAYS = 3_600_000, 30, 10
 def write_items(folder: Path) -> LogMapping:
     begins = [START + 6 * HOUR * number - 12 * HOUR for number in range(40)]
     rows = [(number, begin, begin + LIFE * HOUR) for number, begin in enumerate(begins)]
-    rows += [(40, None, None), (41, None, START + 24 * HOUR), (41, START + 216 * HOUR, None)]
+    rows += [(40, None, None), (40, START, None), (41, None, START + 24 * HOUR)]
+    rows += [(41, START + 216 * HOUR, None)]
     items = pd.DataFrame(rows, columns=["item_id", "born", "available_until"]).astype("Int64")
     items["kind"] = (items.item_id % 3).astype(str)
     file = write(items, folder / "items.parquet")
@@ -164,8 +165,12 @@ def test_times_that_cannot_be_are_refused_or_noted(
     write(frame.assign(born=frame.born + HOUR), tmp_path / "items.parquet")
     with pytest.warns(InputNote, match="rows show an item at a time at which"):
         prepare([log], mapping, tmp_path / "store", PrepareOptions())
+    late = frame.available_until.astype("string").where(frame.item_id != 3, "31 Jan 2023")
+    write(frame.assign(available_until=late), tmp_path / "items.parquet")
+    with pytest.raises(InputError, match=r"items.parquet: available_until is no time in 1 rows"):
+        prepare([log], mapping, tmp_path / "unread", PrepareOptions())
     write(frame.assign(born=frame.available_until), tmp_path / "items.parquet")
-    with pytest.raises(InputError, match=r"items.parquet: 41 of 43 rows .* not after"):
+    with pytest.raises(InputError, match=r"items.parquet: 41 of 44 rows .* not after"):
         prepare([log], mapping, tmp_path / "other", PrepareOptions())
 
 

@@ -93,3 +93,16 @@ def test_rows_beside_their_candidates_are_noted_and_bad_columns_refused(tmp_path
         prepared(outside, tmp_path / "store")
     with pytest.raises(InputError, match=r"candidates .*use a list of item_ids"):
         prepared(write(log.assign(candidates=0.5), tmp_path / "bad.parquet"), tmp_path / "bad")
+    named = write(log.assign(candidates="a"), tmp_path / "named.parquet")
+    several, no_list = (
+        "candidates a names several sets",
+        r"(DOUBLE..|BIGINT); use a list of item_ids",
+    )
+    for items, says in (([[3, 4], [3]], several), ([[3.0]], no_list), ([3], no_list)):
+        names = pd.DataFrame({"candidates": "a", "items": items})
+        write(names, tmp_path / "named.candidates.parquet")
+        with pytest.raises(InputError, match=says):
+            prepared(named, tmp_path / "named")
+    empty = write(log.assign(candidates=[[]] * len(log)), tmp_path / "empty.parquet")
+    every = prepared(empty, tmp_path / "every").record.fingerprint
+    assert every != EpisodeStore.open(tmp_path / "store").record.fingerprint

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from tests.support.logs import START
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, validate
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
 
 def write_log(folder: Path, times: np.ndarray, **columns: object) -> Path:
@@ -41,6 +42,22 @@ def test_splits_begin_at_a_place_of_the_sorted_times(
     ordered = [*np.sort(times), times.max() + 1]
     places = round(200 * shares[0]), round(200 * (shares[0] + shares[1]))
     assert report["split_times_ms"] == [START + ordered[place] for place in places]
+
+
+def test_a_request_is_one_decision_whatever_the_order_of_its_rows(tmp_path: Path) -> None:
+    """Over a pause, with another session_id, without a position; rows without one stand alone."""
+    hours = np.repeat([0, 1, 2, 3, 4], [1, 1, 1, 3, 3]) * 3_600_000
+    log = pd.read_parquet(write_log(tmp_path, hours, item_id=range(9), session_id=range(9)))
+    log["request_id"] = ["a"] * 3 + [None] * 3 + ["b"] * 3
+    log["position"] = [0, 1, 2, None, None, None, 2, 1, None]
+    log = pd.concat([log, log.assign(position=9 - log.position, excludes_seen=True)])
+    options, stores = PrepareOptions(split=(1.0, 0.0, 0.0), session_by="gap", min_steps=1), []
+    for seed in range(4):
+        log.sample(frac=1, random_state=seed).to_parquet(tmp_path / "log.parquet")
+        prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / f"{seed}", options)
+        stores.append(EpisodeStore.open(tmp_path / f"{seed}"))
+        assert stores[seed].column("place").tolist() == [0, 1, 2, 0, 0, 0, 0, 1, 2]
+        assert stores[seed].record.fingerprint == stores[0].record.fingerprint
 
 
 def test_rows_before_the_one_that_precedes_them_in_time_are_out_of_order(tmp_path: Path) -> None:

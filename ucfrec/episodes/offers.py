@@ -1,5 +1,6 @@
 """What was on offer: the items that a decision could show, by its time and its candidates."""
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -42,8 +43,9 @@ class Offers:
 
     @property
     def intervals(self) -> IntArray:
-        """(3, I) int64 item, begin and end of all intervals that have a bound."""
-        bounded = torch.nonzero((self.begin != ALWAYS[0]) | (self.end != ALWAYS[1]))[:, 0]
+        """(3, I) int64 item, begin and end of the intervals of items that are not always there."""
+        some = (self.begin != ALWAYS[0]) | (self.end != ALWAYS[1])
+        bounded = torch.nonzero(some.index_fill(0, self.later[0], True))[:, 0]
         first = torch.stack([bounded, self.begin[bounded], self.end[bounded]])
         return torch.cat([first, self.later], dim=1).numpy()
 
@@ -81,6 +83,11 @@ class Offers:
             if bool((offers.later[0].diff() < 0).any() | (offers.pairs.diff() <= 0).any()):
                 raise ValueError("its items are not in order")
             return offers
+
+    def digest(self) -> str:
+        """SHA-256 of all numbers."""
+        parts = [getattr(self, part.name).contiguous().numpy() for part in fields(self)]
+        return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
     @cached_property
     def pairs(self) -> Tensor:

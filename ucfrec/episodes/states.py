@@ -129,14 +129,8 @@ class ItemStates:
         padded = F.pad(embedded, (0, 1), value=1.0)
         sums = padded.new_zeros(2, batch, length, padded.shape[-1])
         weights = counts.unfold(2, self.window, 1) * self._decays  # type: ignore[attr-defined]
-        of_lags = (
-            weights.unsqueeze(-1).unbind(3),
-            padded.unfold(
-                1,
-                self.window,
-                1,
-            ).unbind(-1),
-        )
+        vectors = padded.unfold(1, self.window, 1).unbind(-1)
+        of_lags = weights.unsqueeze(-1).unbind(3), vectors
         # Floating-point sums depend on their order: the most recent item comes first.
         for weight, vector in reversed(list(zip(*of_lags, strict=True))):
             sums = sums.add_(weight * vector)

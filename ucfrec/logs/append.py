@@ -19,7 +19,6 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder
@@ -121,15 +120,8 @@ def append_logs(
         memory_limit=options.memory_limit,
         gap_minutes=(old.source.session_gap_ms or 1_800_000) / 60_000,
     )
-    late = (
-        _rows_after(
-            end,
-            store,
-            shards,
-        )
-        if any((s.times > end).any() for s in shards)
-        else None
-    )
+    is_later = any((shard.times > end).any() for shard in shards)
+    late = _rows_after(end, store, shards) if is_later else None
     with (
         atomic_folder(out) as folder,
         read_log(files, mapping, reading, out.parent, store, grows=True, held=late) as log,
@@ -328,9 +320,8 @@ def _write(
     fill = {name: float(_FILL.get(name, np.nan)) for name in (*old.columns, *added)}
     with progress(log.report["steps"], "write the new shards", "steps") as bar:
         writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, log.offers, log.sets)
-    if log.offers is not None:
-        log.offers.save(folder / OFFERS)
-    new = writer.finish(log.report["reward"], log.report, write_ids(typed, folder))
+    ids = write_ids(typed, folder, log.offers)
+    new = writer.finish(log.report["reward"], log.report, ids)
     expired = sum(int(shard.lengths[~shard.stays].sum()) for shard in shards)
     report = {**log.report, **counts, "expired_steps": expired}
     files = dict(new.files)

@@ -12,9 +12,9 @@ from ucfrec import schema
 from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
-from ucfrec.logs.engine import bind, text_of_column, to_arrow
+from ucfrec.logs.engine import bind, text_of_column, to_arrow, wrong_type
 from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
-from ucfrec.logs.tables import open_tables
+from ucfrec.logs.tables import NOTHING, is_integer, open_tables
 from ucfrec.logs.typed import KEY_OF_LIST, TypedLog
 
 ITEMS = "items"
@@ -92,7 +92,7 @@ def _select_sets(log: TypedLog) -> str:
     for table in log.tables:
         text = text_of_column(connection, table, log.mapping, schema.CANDIDATES)
         value = bind(connection, table, f"for {schema.CANDIDATES}", text)
-        if value.kind.endswith("[]"):
+        if value.kind.endswith("[]") and NOTHING not in value.kind:
             lists.append(_SETS.format(KEY_OF_LIST.format(value.sql), value.sql, table.sql))
     files = [file for table in log.tables for file in table.files]
     return select_named_sets(connection, list_set_files(log.mapping, files), lists)
@@ -106,9 +106,15 @@ def select_named_sets(
     every = [*lists, _SETS.format("CAST(NULL AS VARCHAR)", "CAST([] AS VARCHAR[])", "range(0)")]
     for table in open_tables(connection, files) if files else ():
         name, ids = (bind(connection, table, "of sets", n) for n in (schema.CANDIDATES, ITEMS))
-        every.append(_SETS.format(f"CAST({name.sql} AS VARCHAR)", ids.sql, table.sql))
-    rows = " UNION ALL ".join(every)
-    return f"SELECT {schema.CANDIDATES}, any_value({ITEMS}) AS {ITEMS} FROM ({rows}) GROUP BY ALL"
+        kind, _, is_list = ids.kind.partition("[")
+        if not (kind in ("VARCHAR", "UUID") or (is_list and is_integer(kind))):
+            raise wrong_type(table, "of sets", ITEMS, ids.kind, "use a list of item_ids")
+        columns = f"CAST({name.sql} AS VARCHAR), CAST({ids.sql} AS VARCHAR[])"
+        every.append(f"SELECT {columns} FROM {table.sql}")
+    several, rows = f"count(DISTINCT list_sort({ITEMS})) > 1", " UNION ALL ".join(every)
+    fault = f"error('{schema.CANDIDATES} ' || {schema.CANDIDATES} || ' names several sets')"
+    value = f"CASE WHEN {several} THEN {fault} ELSE any_value({ITEMS}) END AS {ITEMS}"
+    return f"SELECT {schema.CANDIDATES}, {value} FROM ({rows}) GROUP BY {schema.CANDIDATES}"
 
 
 def write_sets(log: Path, sets: pa.Table) -> None:

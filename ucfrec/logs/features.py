@@ -39,12 +39,7 @@ if TYPE_CHECKING:
 
     from ucfrec.episodes.offers import Offers
 
-_KINDS = {
-    "DOUBLE": "numbers",
-    "VARCHAR": "categories",
-    "VARCHAR[]": "tags",
-    "FLOAT[]": "vectors",
-}
+_KINDS = {"DOUBLE": "numbers", "VARCHAR": "categories", "VARCHAR[]": "tags", "FLOAT[]": "vectors"}
 CATEGORIES = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP = 5.0
@@ -220,7 +215,12 @@ def _select_part(
     columns = (column for source in (*sources, *times.values()) for column in source.columns)
     narrow = opened.of(columns, raw)
     for name, time in times.items():
-        values[name] = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)[0]
+        sql, _ = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)
+        given = f"trim(CAST({time.sql} AS VARCHAR)) NOT IN ('', 'nan')"
+        if unread := _count(connection, f"{narrow.sql} WHERE {given} AND ({sql}) IS NULL"):
+            fault = f"{name} is no time in {unread:,} rows; write ISO 8601, or nothing for no bound"
+            raise InputError(f"{opened.files[0]}: {fault}")
+        values[name] = sql
     features = "".join(f", {sql} AS {name}" for name, sql in values.items())
     return f"SELECT {id_sql} AS id{features} FROM {narrow.sql}{first}"
 

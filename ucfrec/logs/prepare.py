@@ -19,7 +19,7 @@ from pydantic import Field, InstanceOf
 
 from ucfrec import schema
 from ucfrec.arrays import IntArray
-from ucfrec.episodes.item_table import ITEM_STATES, OFFERS
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
@@ -164,9 +164,7 @@ def prepare(
                 writer = sessions.write_steps(
                     log.rows, log.cut, folder, bar, offers=log.offers, sets=log.sets
                 )
-            if log.offers is not None:
-                log.offers.save(folder / OFFERS)
-            ids = sessions.write_ids(typed, folder)
+            ids = sessions.write_ids(typed, folder, log.offers)
             for name, tables in log.features.items():
                 if tables:
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]

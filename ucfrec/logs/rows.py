@@ -199,6 +199,10 @@ class SortedRows:
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
+        if _REQUEST in batch:
+            # Rows without a request stay in the order of their hashes.
+            alone = batch[_REQUEST] < 0
+            batch[_REQUEST] = np.where(alone, np.arange(-len(alone), 0), batch[_REQUEST])
         list_keys = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
         if list_keys:
             order = np.lexsort([*list_keys, times, batch[USER]])
@@ -211,7 +215,7 @@ class SortedRows:
             _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
             order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
-        batch[schema.PLACE] = places = _find_places(batch)
+        batch[schema.PLACE] = places = _find_places(batch, by_session)
         self.has_lists |= bool(places.any())
         self.file.append(batch)
 
@@ -233,13 +237,13 @@ class SortedRows:
         return {name: values[source] for name, values in batch.items()}
 
 
-def _find_places(batch: dict[str, Array]) -> IntArray:
+def _find_places(batch: dict[str, Array], by_session: bool) -> IntArray:
     """(M,) place of each row in its decision, from 0, of rows in order, which lose their requests
     and positions."""
     batch.pop(schema.POSITION, None)
     decision = batch.pop(_REQUEST, batch[schema.TIMESTAMP])
     goes_on = _equal_before(batch[USER]) & _equal_before(decision)
-    if SESSION in batch:
+    if by_session:
         goes_on &= _equal_before(batch[SESSION])
     rows = np.arange(len(decision))
     return (rows - np.maximum.accumulate(np.where(np.append(False, goes_on), 0, rows))).astype(
@@ -385,7 +389,7 @@ def order_rows(log: TypedLog, rows: str) -> str:
         # A row without a request is a decision of its own.
         columns[_REQUEST] = f"coalesce({HASH.format(schema.REQUEST_ID)}, -row)"
     if schema.POSITION in log.columns:
-        columns[schema.POSITION] = f"coalesce({schema.POSITION}, 0)"
+        columns[schema.POSITION] = f"coalesce({schema.POSITION}, CAST('inf' AS DOUBLE))"
     choice = ITEM if schema.ITEM_ID in tables else schema.ACTION
     values = ", ".join(f"{sql} AS {name}" for name, sql in columns.items())
     names = ", ".join(name for name in columns if name != "tie")
@@ -477,7 +481,9 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     finite = np.abs(rewards) <= MAX_FLOAT
     rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
     keys = [~finite, np.where(finite, rule[duplicates], 0)]
-    for name in (schema.OBSERVATION, schema.PROPENSITY, SESSION, schema.IS_RANDOM, CANDIDATE_SET):
+    others = [schema.OBSERVATION, schema.PROPENSITY, SESSION, schema.IS_RANDOM, CANDIDATE_SET]
+    others += [schema.POSITION, schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, _REQUEST]
+    for name in others:
         if name in rows:
             keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
     return [rows["row"], *keys[::-1]]

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
@@ -120,7 +121,7 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
                 previous, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
                 is_other = np.where(previous < 0, began > times[:-1], began != previous)
                 pause = np.where(began < 0, pause, is_other)
-            ends = user_ends | np.append(pause, True)
+            ends = user_ends | np.append(pause & (batch[schema.PLACE][1:] == 0), True)
             last_ends = rows.last_ms - times > cut.gap_ms
         elif cut.session_by == schema.SESSION_ID:
             ends = user_ends | np.append(batch[SESSION][1:] != batch[SESSION][:-1], True)
@@ -369,8 +370,9 @@ def list_text_ids(store: Path | None) -> tuple[str, ...]:
     )
 
 
-def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
-    """Write `users.parquet` and `items.parquet`; returns a digest of each for the fingerprint."""
+def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str, list[Any]]:
+    """Write `users.parquet`, `items.parquet` and when items are on offer; returns a digest of each
+    for the fingerprint."""
     digests: dict[str, list[Any]] = {}
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -382,6 +384,9 @@ def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
         for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
             digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
         digests[name] = [digest.hexdigest()]
+    if offers is not None:
+        offers.save(folder / OFFERS)
+        digests["offers"] = [offers.digest()]
     return digests
 
 
@@ -446,11 +451,7 @@ def write_steps(
             schema.SPLIT: episodes.splits,
             schema.TERMINATED: episodes.terminated,
         }
-        writer.append(
-            steps,
-            first,
-            {n: np.repeat(v, lengths) for n, v in values.items()},
-        )
+        writer.append(steps, first, {n: np.repeat(v, lengths) for n, v in values.items()})
         display.update(count)
     if unavailable:
         warn_user(

@@ -320,7 +320,7 @@ def cast_value(
     """SQL that casts a column to its type in the schema, and that DuckDB type."""
     sql, kind = bound.sql, bound.kind
     nothing = "false" if _TYPES[name] == "BOOLEAN" else f"CAST(NULL AS {_TYPES[name]})"
-    if kind == NOTHING:
+    if kind.removesuffix("[]") == NOTHING:
         return nothing, NOTHING
     # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
     inexact = {schema.TIMESTAMP: ("FLOAT",), **dict.fromkeys(_IDS, WHOLE)}.get(name, ())

@@ -17,7 +17,6 @@ from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
-    Final,
     Literal,
     ParamSpec,
     TypeVar,
@@ -107,7 +106,7 @@ def allowed_values(table: Any, name: str) -> str:
     return _allowed(info.annotation, info.metadata)
 
 
-is_table: Final = is_pydantic_dataclass
+is_table = is_pydantic_dataclass
 """Whether a class itself is decorated by `settings_table`, not only a base class of it."""
 
 
@@ -215,7 +214,7 @@ def require_whole(
     return whole
 
 
-require_seed: Final = partial(require_whole, least=0, most=LARGEST_SEED)
+require_seed = partial(require_whole, least=0, most=LARGEST_SEED)
 """`require_whole` for seeds."""
 
 

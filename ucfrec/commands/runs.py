@@ -57,7 +57,8 @@ class Promote(Table):
             folder = self.run.parent if (self.run / RUN_RECORD).is_file() else self.run
             pointer = promote_back(folder)
         else:
-            folder, pointer = self.run.resolve().parent, promote(self.run, self.force)
+            folder = self.run.resolve().parent
+            pointer = promote(self.run, self.force)
         previous = f", before it {pointer.previous[-1]}" if pointer.previous else ""
         print(f"current run: {pointer.current}{previous} ({folder / POINTER})")
         if not self.back:

@@ -208,7 +208,8 @@ def find_candidates(
     count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
     sampled = np.sort(order[: max(1, int(count))])
     lengths = view.lengths[sampled]
-    episodes, steps = np.repeat(sampled, lengths), _ranges(np.zeros_like(lengths), lengths)
+    episodes = np.repeat(sampled, lengths)
+    steps = _ranges(np.zeros_like(lengths), lengths)
     rewards = view.step_values(schema.REWARD, episodes, steps)
     high = rewards >= np.quantile(rewards, config.reward_quantile)
     return episodes[high], steps[high]

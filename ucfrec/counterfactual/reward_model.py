@@ -317,7 +317,8 @@ def _fit_mean(
     def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
         return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
 
-    first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rows[1]))
+    first = copy.deepcopy(model.expected.state_dict())
+    whole = _loop(model.config, len(rows[1]))
     best, weights = math.inf, first
     for share in _REGRESSION_SHARES:
         steps = max(1, whole.steps // share)

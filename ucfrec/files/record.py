@@ -13,7 +13,7 @@ from collections.abc import Container, Iterator, Mapping
 from functools import partial
 from hashlib import file_digest
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import xxhash
 from pydantic import (
@@ -69,7 +69,7 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
     return files
 
 
-_ABSENT: Final[tuple[object, ...]] = (None, (), [], {})
+_ABSENT: tuple[object, ...] = (None, (), [], {})
 
 
 class Entry(BaseModel):

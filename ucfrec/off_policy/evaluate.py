@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -83,7 +83,7 @@ class EstimateOptions:
 
 
 DEFAULTS = EstimateOptions()
-ASSUMPTIONS: Final[Mapping[Positions, str]] = {
+ASSUMPTIONS: Mapping[Positions, str] = {
     "whole list": "the whole list",
     "cascade": "the item and those above it",
     "independent": "the item alone",

@@ -214,7 +214,8 @@ class SequencePolicy(nn.Module, ABC):
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
         normalized = self.normalize(windows)
-        features, exposed = self.features(normalized)[:, -1], self.exposed(normalized, last=True)
+        features = self.features(normalized)[:, -1]
+        exposed = self.exposed(normalized, last=True)
         return self.head.losses(features, windows.actions[:, -1], exposed).mean()
 
     def act(self, windows: Windows) -> Tensor:

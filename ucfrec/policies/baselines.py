@@ -380,7 +380,8 @@ class BPRPolicy(LikedPolicy):
         rows = torch.nonzero(liked)[:, 0]
         losses = []
         for part in torch.split(rows, max(1, _AT_ONCE // len(self.of_history.weight))):
-            scores, items = self.act(windows.at(part)), windows.actions[part, -1:]
+            scores = self.act(windows.at(part))
+            items = windows.actions[part, -1:]
             losses.append(-F.logsigmoid(scores.gather(1, items) - scores).mean(1))
         return torch.cat(losses).mean()
 
@@ -494,11 +495,13 @@ class BoostedPolicy(LikedPolicy):
         action and reward are not read; counts (2, B, C) of shown and liked ones, or None for all
         rows."""
         valid = windows.mask[:, :-1].float()  # (B, N)
-        earlier, liked = windows.actions[:, :-1], self.find_liked(windows)[:, :-1]
+        earlier = windows.actions[:, :-1]
+        liked = self.find_liked(windows)[:, :-1]
         if counts is None:
             counts = torch.stack([self.impressions[items], self.liked[items]])
         shown_of, liked_of = counts
-        count, likes = valid.sum(1, keepdim=True), liked.sum(1, keepdim=True)
+        count = valid.sum(1, keepdim=True)
+        likes = liked.sum(1, keepdim=True)
         cosines = self.directions[items] @ self.directions[earlier].mT  # (B, C, N)
         # Products of other batches differ in the last bits, which could change a tree's branch.
         cosines = _round(cosines)

@@ -51,7 +51,8 @@ def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str
     policy.eval()
     try:
         _check_answer(policy, train)
-        windows, most = _sample(train, policy.config.context), max(policy.config.context // 2, 1)
+        windows = _sample(train, policy.config.context)
+        most = max(policy.config.context // 2, 1)
         padded = _sample(train, policy.config.context, most)
         rows = [_outputs(policy, part) for part in (padded, padded.last(most))]
         (features, acts), (short_features, short_acts) = rows

@@ -9,7 +9,7 @@ from dataclasses import asdict, fields
 from datetime import date
 from html import escape
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import pandas as pd
 
@@ -62,7 +62,7 @@ from ucfrec.settings import (
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
-_checked: Final = check_arguments(
+_checked = check_arguments(
     {
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,

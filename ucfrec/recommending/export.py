@@ -229,7 +229,8 @@ def _draw_inputs(
     items excluded are numbers, or a `mask` of all items."""
     states, length, rng = scorer.states, scorer.length, np.random.default_rng(seed)
     assert states is not None
-    n, steps = len(states.embeddings), rng.integers(0, 2 * length + 1, size=sessions)
+    n = len(states.embeddings)
+    steps = rng.integers(0, 2 * length + 1, size=sessions)
     inside = np.arange(length) >= length - steps[:, None]
     rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
     rewards = np.where(inside, rewards, 0.0).astype(np.float32)

@@ -87,7 +87,8 @@ def exposures_written(
     Requests are a millisecond apart, from the time `at` on, or from now, so that a split by time
     can part them.
     """
-    columns, begin = exposure_schema(trained), read_time(at) or int(time.time() * 1000)
+    columns = exposure_schema(trained)
+    begin = read_time(at) or int(time.time() * 1000)
     constants: dict[str, str | bool] = {
         schema.RUN: trained.fingerprint,
         schema.RULE: rule,

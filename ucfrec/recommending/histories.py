@@ -65,7 +65,8 @@ def histories_of_frame(
     Args:
         stored: whether the frame is of a store, whose column `reward` is what was computed.
     """
-    record, columns = trained.record, {str(name) for name in getattr(frame, "columns", ())}
+    record = trained.record
+    columns = {str(name) for name in getattr(frame, "columns", ())}
     computed = not stored and computes_with_reward(record.reward)
     # What the run remembers of its training log may mean columns of the frame.
     texts = " ".join([*record.data.mapping.values(), record.data.where or ""]).casefold()

@@ -167,7 +167,8 @@ def _describe(errors: Sequence[Any]) -> str:
     places = [tuple(part for part in error["loc"] if part not in _TYPES) for error in errors]
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_uncapitalise(first['msg'])})"
-    where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
+    where = ".".join(map(str, places[0])) or "the request"
+    more = len(set(places)) - 1
     same = zip(errors, places, strict=True)
     messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
     value = first.get("input")

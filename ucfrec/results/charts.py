@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from ucfrec.errors import one_line
 from ucfrec.files.atomic import atomic_file
@@ -32,7 +32,7 @@ _VARIABLES = ("ink", "soft", "rule", "paper", *(f"c{series}" for series in range
 _COLORS = {f"#01{number:02x}fe": name for number, name in enumerate(_VARIABLES)}
 INK, SOFT, RULE, PAPER, *SERIES = _COLORS
 _DASHES = ("solid", "dashed", "dotted")
-_SHARED_STYLE: Final[Any] = {
+_SHARED_STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
@@ -41,7 +41,7 @@ _SHARED_STYLE: Final[Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "ucfrec",
 }
-_STYLE: Final[Any] = {
+_STYLE: Any = {
     **_SHARED_STYLE,
     "font.size": 11,
     "text.color": INK,
@@ -229,7 +229,7 @@ PLAIN, OURS = "#8C8C8C", "#D55E00"
 """Colors of other methods, and of UCF."""
 _NOT_IN_NAMES = re.compile(r"[^\w,.= -]+")
 
-_FILE_STYLE: Final[Any] = {
+_FILE_STYLE: Any = {
     **_SHARED_STYLE,
     "figure.dpi": 200,
     "font.size": 8,

@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +29,7 @@ from ucfrec.settings import (
 )
 
 TABLES = ("policy", "train", "crm", "csg", "augment", "rule")
-_KINDS: Final[tuple[Any, ...]] = (LoopConfig, CRMConfig, CSGConfig, AugmentConfig, RuleConfig)
+_KINDS: tuple[Any, ...] = (LoopConfig, CRMConfig, CSGConfig, AugmentConfig, RuleConfig)
 
 
 @settings_table("")

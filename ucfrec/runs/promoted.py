@@ -98,7 +98,9 @@ def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
 
 
 def _require_verdict(run: Path, pointer: Promoted) -> None:
-    update, fault, current = RunRecord.read(run).update, "", pointer.run(run.parent)
+    update = RunRecord.read(run).update
+    fault = ""
+    current = pointer.run(run.parent)
     if update is None or update.verdict is None:
         fault = f"has no verdict against the current run {current.name}"
     elif update.run != TrainedPolicy.load(current, split=True).fingerprint:

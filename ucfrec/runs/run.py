@@ -291,7 +291,8 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     states, returns, config = run.logged.item_states, run.record.return_to_go, run.config.rule
     # What `TrainedPolicy.load` reads, but for a second policy and a second table of items.
     values, _ = load_tensors(run.out / RETURNS)
-    rule, no_users = read_rule(run.out / RULE), np.zeros(0, dtype=np.int64)
+    rule = read_rule(run.out / RULE)
+    no_users = np.zeros(0, dtype=np.int64)
     trained = TrainedPolicy(
         run.out, run.policy, run.record, states, None, no_users, values["returns"].numpy(), rule
     )

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
 from optuna import Trial
 
@@ -53,7 +53,7 @@ class Dimension:
 
 Space = Mapping[str, Dimension]
 """Setting, as `table.field`, to its values."""
-NETWORK: Final[Space] = {
+NETWORK: Space = {
     "train.learning_rate": Dimension(low=1e-4, high=3e-3, log=True),
     "train.steps": Dimension(low=500, high=10_000, log=True),
     "policy.dim": Dimension((32, 64, 128, 256)),
@@ -62,13 +62,13 @@ NETWORK: Final[Space] = {
     "augment.actions": Dimension((0, 2)),
 }
 """Of policies that are trained step by step."""
-HISTORY: Final[Space] = {
+HISTORY: Space = {
     "policy.context": Dimension((5, 10, 20, 50)),
     "policy.exposure": Dimension((True, False)),
 }
 """Of those that read what was shown before, too."""
-NEIGHBORS: Final[Space] = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
-REWARD_WEIGHTS: Final[Space] = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0))}
+NEIGHBORS: Space = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
+REWARD_WEIGHTS: Space = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0))}
 
 
 def read_space(path: Path) -> Space:

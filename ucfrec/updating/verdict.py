@@ -117,7 +117,8 @@ def _judge_items(
         probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
         # From 1; items of equal scores share the mean rank.
         score = batch.scores.gather(1, column)
-        above, equal = (batch.scores > score).sum(1), (batch.scores == score).sum(1)
+        above = (batch.scores > score).sum(1)
+        equal = (batch.scores == score).sum(1)
         rank = 1 + above.double() + (equal - 1).double() / 2
         gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
         probabilities.append(probability.masked_fill(unknown, 0.0).numpy())

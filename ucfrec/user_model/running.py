@@ -7,7 +7,6 @@ rows would be unknown for items that are new, and known too well for those befor
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import torch
@@ -18,18 +17,17 @@ from ucfrec.episodes.item_table import ALWAYS
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 
-_HOUR_MS: Final = 3_600_000
+_HOUR_MS = 3_600_000
 HALF_LIVES = (6.0, 24.0, 96.0, math.inf)
 """Hours after which a row counts half, one rate each."""
 AGES = 2
 """Inputs of an item's age: in days, and the logarithm of its hours and 1."""
-_PRIOR: Final = 20.0
+_PRIOR = 20.0
 """Rows with the mean reward that are added to those of an item."""
-_ENTRIES: Final = 2**24
+_ENTRIES = 2**24
 """Most rates that are kept."""
-_OLDEST: Final = 30.0
+_OLDEST = 30.0
 """Days from which on an item is as old as any."""
-_SMALLEST: Final = 1e-6
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,12 @@ def test_rates_and_ages_are_those_of_the_rows_before(store: EpisodeStore) -> Non
     mean, generator = rewards.mean(dtype=np.float64), np.random.default_rng(1)
     for number in generator.integers(len(items), size=40):
         item, time = int(items[number]), int(times[number])
-        bins = (time - rates.begin) // rates.width - 1 - (times - rates.begin) // rates.width
+        begin, width = rates.bins.begin, rates.bins.width
+        bins = (time - begin) // width - 1 - (times - begin) // width
         of_item = (items == item) & (bins >= 0)
         expected = []
         for hours in HALF_LIVES:
-            weights = 0.5 ** (bins[of_item] * rates.width / HOUR / hours)
+            weights = 0.5 ** (bins[of_item] * width / HOUR / hours)
             total = (weights * (rewards[of_item] - mean)).sum()
             expected.append(total / (weights.sum() + 20))
         episodes, steps = store.locate(np.array([number]))

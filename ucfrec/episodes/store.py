@@ -212,24 +212,22 @@ class EpisodeStore(EpisodeView):
         """A view of all episodes of the store."""
         return EpisodeStore(self._columns)
 
-    def with_returns_to_go(
-        self, values: Float32Array, definition: ReturnToGo | None = None
-    ) -> "EpisodeStore":
+    def with_returns_to_go(self, values: Float32Array) -> "EpisodeStore":
         """A view of the same episodes with other returns-to-go (n_steps,), in reward units and the
-        order of `all_steps`, that count what `definition` says, or None for what they counted
-        before. The files are not changed."""
+        order of `all_steps`. The files are not changed."""
         name, n_steps = schema.RETURN_TO_GO, self.record.n_steps
         returns = self._columns.step_column(name).take(np.arange(n_steps))
         episodes, steps = self.all_steps()
         returns[self._columns.starts[self.episode_ids[episodes]] + steps] = values
-        definition = definition or self.return_to_go
-        columns = self._columns.replace(name, StepColumn([returns]), return_to_go=definition)
-        return EpisodeStore(columns, self._selected)
+        return EpisodeStore(self._columns.replace(name, StepColumn([returns])), self._selected)
 
     def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
         """A view of the same episodes whose returns-to-go are counted by `definition`."""
-        returns = definition.of_logs(self.column(schema.REWARD), _offsets(self.lengths))
-        return self.with_returns_to_go(returns, definition)
+        columns = self._columns
+        rewards = columns.step_column(schema.REWARD).take(np.arange(self.record.n_steps))
+        returns = StepColumn([definition.of_logs(rewards, _offsets(columns.lengths))])
+        columns = columns.replace(schema.RETURN_TO_GO, returns, return_to_go=definition)
+        return EpisodeStore(columns, self._selected)
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
         """A view of the same episodes without some dimensions of the observations, 0 to O − 1."""

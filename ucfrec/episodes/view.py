@@ -18,7 +18,7 @@ from ucfrec.episodes.offers import Offer, Offers
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Transitions, Windows, list_earlier
+from ucfrec.episodes.windows import Transitions, Windows, draw_ends, list_earlier
 from ucfrec.errors import InputError
 
 _DTYPES = {
@@ -403,9 +403,12 @@ class EpisodeView:
             counts += np.bincount(items, minlength=len(counts))
         return counts
 
-    def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
-        return self.locate(generator.integers(self.n_steps, size=count))
+    def draw_steps(
+        self, generator: np.random.Generator, count: int, length: int = 1
+    ) -> tuple[IntArray, IntArray]:
+        """(episodes, steps), each (count,): steps drawn uniformly, with replacement; or the ends of
+        windows of this `length`, such that every step is in as many windows as any other."""
+        return draw_ends(generator, count, self._ends, self.lengths, length)
 
     def locate(self, numbers: IntArray) -> tuple[IntArray, IntArray]:
         """(episodes, steps) of the steps with the given indices in `all_steps`, of any shape."""
@@ -485,8 +488,10 @@ class EpisodeView:
         if self.has_items:
             actions = actions.long()
         windows = Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
-        offer = self.offer(episodes[:, None], steps.clip(min=0))
-        return replace(windows, offer=offer, decides=decides)
+        offer, times = self.offer(episodes[:, None], steps.clip(min=0)), None
+        if self.has_items and schema.TIMESTAMP in self.record.columns:
+            times = torch.from_numpy(columns.step_column(schema.TIMESTAMP).take(index))
+        return replace(windows, offer=offer, times=times, decides=decides)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
         """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""

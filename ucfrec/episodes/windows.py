@@ -64,6 +64,8 @@ class Windows(_Rows):
     """(B, K) bool, true at steps of the episode, false at padding."""
     offer: Offer | None = None
     """What was on offer at each of the (B, K) steps; None for everything."""
+    times: Tensor | None = None
+    """(B, K) int64 ms of the steps; None where items are not known by time."""
     decides: Tensor | None = None
     """(B, K) bool, false where a step is a later row of a decision with several; None for true."""
 
@@ -193,6 +195,8 @@ class Exposed(_Rows):
     """(M,) returns-to-go in units of the policy's return scale."""
     offer: Offer | None = None
     """Of the M steps; None for everything."""
+    times: Tensor | None = None
+    """(M,) int64 ms of the steps, in training; None for the latest."""
 
     @classmethod
     def before(
@@ -209,6 +213,7 @@ class Exposed(_Rows):
             _earlier(windows.rewards, lags, 0),
             windows.returns_to_go.flatten(),
             windows.offer and windows.offer.change(torch.flatten),
+            None if windows.times is None else windows.times.flatten(),
         )
         return exposed if steps is None else exposed._change(lambda part: part[steps.flatten()])
 
@@ -218,6 +223,20 @@ class Exposed(_Rows):
         recent = Shown.before_last(windows.last(lags + 1)).padded(lags)
         offer = windows.offer and windows.offer.change(lambda part: part[:, -1])
         return cls(recent.items, recent.rewards, windows.returns_to_go[:, -1], offer)
+
+
+def draw_ends(
+    generator: np.random.Generator, count: int, ends: IntArray, lengths: IntArray, length: int
+) -> tuple[IntArray, IntArray]:
+    """See `EpisodeView.draw_steps`; `ends` (E,) are running totals of steps that are drawn, which
+    are the last of `lengths` (E,)."""
+    # Windows that would end up to `length` − 1 steps after a session end with it.
+    if length > 1:
+        ends = ends + (length - 1) * np.arange(1, len(ends) + 1)
+    numbers = generator.integers(ends[-1], size=count)
+    episodes = np.searchsorted(ends, numbers, side="right")
+    steps = numbers - ends[episodes] + lengths[episodes] + length - 1
+    return episodes, np.minimum(steps, lengths[episodes] - 1)
 
 
 def pad_columns(values: Tensor, length: int, padding: int) -> Tensor:
@@ -485,18 +504,17 @@ class TrainingEpisodes:
         self._ends = np.cumsum(counts)
         self.n_steps = int(self._ends[-1])
         """Number of steps that are drawn."""
-        # The step at which an episode ends, less the number of its last drawn step.
-        self._begins = self._ends - lengths
+        self._lengths = lengths
         self._stride = int(augmented.edit_step.max(initial=0)) + 1
         keys = augmented.edit_copy * self._stride + augmented.edit_step
         # A sentinel, so that every search ends inside.
         self._keys = np.append(keys, np.iinfo(np.int64).max)
 
-    def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
-        numbers = generator.integers(self.n_steps, size=count)
-        episodes = np.searchsorted(self._ends, numbers, side="right")
-        return episodes, numbers - self._begins[episodes]
+    def draw_steps(
+        self, generator: np.random.Generator, count: int, length: int = 1
+    ) -> tuple[IntArray, IntArray]:
+        """As `EpisodeStore.draw_steps`."""
+        return draw_ends(generator, count, self._ends, self._lengths, length)
 
     def windows(
         self,

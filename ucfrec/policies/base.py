@@ -98,6 +98,11 @@ class SequencePolicy(nn.Module, ABC):
     """Buffers that `make_solver` chooses on held-out episodes; a refit keeps them."""
     items_only: ClassVar[str] = ""
     """Name of a policy that recommends items and refuses vectors; empty for others."""
+    counts_steps_alike: ClassVar[bool] = False
+    """Whether windows are drawn so that every step is in as many as any other; otherwise their last
+    steps are drawn uniformly, and the last steps of a session are in fewer."""
+    refit_share: ClassVar[float] = 0.25
+    """Steps of a refit, as a share of those that the best weights took."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
@@ -248,7 +253,7 @@ class SequencePolicy(nn.Module, ABC):
     ) -> Exposed | None:
         """What was shown before each of the (B·K) steps, before the `steps` of a mask (B, K), or
         before the `last` steps (B,) alone; None without `policy.exposure` and offers."""
-        if self.head.exposure is None and windows.offer is None:
+        if self.head.exposure is None and windows.offer is None and windows.times is None:
             return None
         lags = 1 if self.head.exposure is None else self.head.exposure.lags
         if last:

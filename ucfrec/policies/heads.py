@@ -1,5 +1,6 @@
 """Action heads, which embed and predict actions, vectors or items."""
 
+from dataclasses import replace
 from typing import Self
 
 import torch
@@ -9,6 +10,7 @@ from torch.nn import functional as F
 from ucfrec.episodes.exposure import ExposureTerm
 from ucfrec.episodes.offers import columns_of
 from ucfrec.episodes.windows import Exposed
+from ucfrec.user_model.running import HALF_LIVES_OF_DEMAND, Demand
 
 _AT_ONCE = 2**24
 """Largest number of logits that a loss over all items of a large catalogue keeps at once."""
@@ -77,8 +79,9 @@ class ItemHead(nn.Module):
 
     An item's vector is a learned projection of its fixed embedding, which items without training
     steps have too, plus a correction learned per item. The bias begins as the log of the item's
-    share of the training steps. With an exposure term, what the session was shown lately moves the
-    logits too; a dot product cannot say "unlike what was just shown".
+    share of the training steps; `follow` moves it to the shares of the time. With an exposure term,
+    what the session was shown lately moves the logits too; a dot product cannot say "unlike what
+    was just shown".
 
     With `samples`, training takes the softmax over items drawn for the batch (`Proposal`) instead
     of all, subtracting the log of their expected number of draws from their logits (Bengio &
@@ -88,6 +91,9 @@ class ItemHead(nn.Module):
 
     embeddings: Tensor
     counts: Tensor
+    prior: Tensor
+    recency: Tensor
+    mixture: Tensor
 
     def __init__(
         self,
@@ -103,11 +109,15 @@ class ItemHead(nn.Module):
         self.exposure = exposure
         self.register_buffer("embeddings", torch.zeros(n_items, embedding_size))
         self.register_buffer("counts", torch.ones(n_items))
+        self.register_buffer("prior", torch.zeros(n_items))
+        self.register_buffer("recency", torch.zeros(n_items))
+        self.register_buffer("mixture", torch.tensor(HALF_LIVES_OF_DEMAND).isinf().float())
         self.project = nn.Linear(embedding_size, dim)
         self.correction = nn.Parameter(torch.zeros(n_items, dim))
         self.bias = nn.Parameter(torch.zeros(n_items))
         self._kept: tuple[tuple[object, ...], Tensor] | None = None
         self._proposal: Proposal | None = None
+        self._demand: Demand | None = None
 
     def start_from(
         self,
@@ -122,9 +132,42 @@ class ItemHead(nn.Module):
         self.counts.copy_(counts + 1)
         self._proposal = None
         with torch.no_grad():
-            self.bias.copy_(
+            self.prior.copy_(
                 torch.log(self.counts / (self.counts.sum() if even is None else even + 1))
             )
+            self.bias.copy_(self.prior)
+
+    @torch.no_grad()
+    def move_bias(self, prior: Tensor) -> None:
+        """Let the bias have begun as `prior` (n_items,); what was learned since stays."""
+        self.bias.add_(prior - self.prior)
+        self.prior.copy_(prior)
+
+    def follow(self, demand: Demand) -> None:
+        """Add to the bias by how much the shares of the items at the time of a training step, and
+        in evaluation mode the latest, exceed what the bias began with: what the network learns is
+        what the demand of the day does not say."""
+        self.mixture.copy_(demand.mixture)
+        self.recency.copy_(demand.logs[-1] - self.prior)
+        self._demand = replace(demand, logs=demand.logs.to(self.prior))
+
+    @property
+    def acting_bias(self) -> Tensor:
+        """(n_items,) what is added to the products."""
+        return self.bias + self.recency
+
+    def _sum_bias(
+        self, exposed: Exposed | None, items: Tensor | None = None, of_rows: bool = False
+    ) -> Tensor:
+        """The bias of `items` (L,), None for all, (L,) or at the times of M training steps (M, L);
+        with `of_rows`, of one item (M,) of each step, (M,)."""
+        bias = self.bias if items is None else torch.gather(self.bias, 0, items, sparse_grad=True)
+        if not self.training or self._demand is None or exposed is None or exposed.times is None:
+            return bias + (self.recency if items is None else self.recency[items])
+        rows = self._demand.bins.rows(exposed.times)
+        rows = rows if of_rows or items is None else rows.unsqueeze(1)
+        logs = self._demand.logs[rows] if items is None else self._demand.logs[rows, items]
+        return bias + logs - (self.prior if items is None else self.prior[items])
 
     def vectors(self, items: Tensor) -> Tensor:
         """Vectors (..., d) of int64 items (...,)."""
@@ -172,9 +215,11 @@ class ItemHead(nn.Module):
         shown before the M steps, which an exposure term needs; or those (M, L) over `items` (L,),
         ascending, each once, plus an `offset` (L,)."""
         vectors = self.all_vectors() if items is None else self.embed(items)
-        bias = self.bias if items is None else self._gather_bias(items) + offset
+        bias = self._sum_bias(exposed, items) + offset
         # Scaling the features instead of the logits saves two passes over the larger of them.
-        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
+        features = features / features.shape[-1] ** 0.5
+        logits = F.linear(features, vectors, bias if bias.dim() == 1 else None).float()
+        logits = logits if bias.dim() == 1 else logits.add_(bias)
         if exposed is None:
             return logits
         if self.exposure is not None:
@@ -247,13 +292,10 @@ class ItemHead(nn.Module):
     ) -> Tensor:
         """Logits (M,) of the logged items."""
         product = (features * self.embed(actions)).sum(-1) / features.shape[-1] ** 0.5
-        logit: Tensor = product + self._gather_bias(actions)
+        logit: Tensor = product + self._sum_bias(exposed, actions, of_rows=True)
         if self.exposure is not None and exposed is not None:
             return logit + self.exposure.to_items(exposed, actions.unsqueeze(1))
         return logit
-
-    def _gather_bias(self, items: Tensor) -> Tensor:
-        return torch.gather(self.bias, 0, items, sparse_grad=True)
 
 
 Head = VectorHead | ItemHead

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ucfrec import schema
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
@@ -17,7 +18,9 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import Config
+from ucfrec.user_model.running import Demand
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
@@ -49,16 +52,24 @@ def fit_policy(
     """
     k, device, folder = policy.config.context, policy.state_mean.device, out / "policy"
     solve = policy.make_solver(train, validation, folder, config.seed)
+    head = policy.head
     if start is not None:
-        weights = load_tensors(start)[0]
+        weights, began = load_tensors(start)[0], getattr(head, "prior", torch.empty(0)).clone()
         names = policy.state_dict().keys() if solve is None else policy.chosen
         policy.load_state_dict({name: weights[name] for name in names}, strict=solve is None)
+        if isinstance(head, ItemHead) and solve is None:
+            head.move_bias(began)
     alone = solve is not None or distributed.processes() == 1
-    windows = []
+    windows, shown = [], None
+    if train.has_items and not train.has_offers:
+        shown = train.item_counts() > 0
     if validation is not None:
         generator = np.random.default_rng([config.seed, 0])
         for number in range(_VALIDATION_BATCHES):
             episodes, steps = validation.draw_steps(generator, _VALIDATION_BATCH)
+            if shown is not None:  # an item without training steps cannot be learned
+                items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+                episodes, steps = episodes[shown[items]], steps[shown[items]]
             if alone or number % distributed.processes() == distributed.rank():
                 windows.append(validation.windows(episodes, steps, k))
 
@@ -73,15 +84,19 @@ def fit_policy(
     if solve is not None:
         with distributed.leader_first():
             return _fit_once(policy, solve, folder, validate, config.policy_name, callbacks)
+    timed = schema.TIMESTAMP in train.record.columns and not train.has_offers
+    if isinstance(head, ItemHead) and timed:
+        head.follow(Demand.of(train, validation, head.mixture))
     size, rows = config.train.batch_size, distributed.share(config.train.batch_size)
     newest = np.array([], dtype=np.int64) if newest is None else newest
     recent = train.select(newest)
     training = train if augmented is None else TrainingEpisodes(train, augmented)
 
     def draw(generator: np.random.Generator) -> Windows:
-        episodes, steps = training.draw_steps(generator, size)
+        reach = k if policy.counts_steps_alike else 1
+        episodes, steps = training.draw_steps(generator, size, reach)
         if len(newest):
-            of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
+            of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]), reach)
             episodes[::2] = newest[of_recent]
         windows = training.windows(episodes[rows], steps[rows], k)
         return windows if device.type == "cpu" else windows.to(device)

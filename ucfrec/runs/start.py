@@ -19,7 +19,7 @@ from ucfrec.counterfactual.reward_model import INITIAL
 from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.states import TrainingCounts
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder, write_json
 from ucfrec.fitting.checkpoint import save_tensors
@@ -49,7 +49,8 @@ _CRM_EPOCHS = 5
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
-    """The training and the validation episodes of a store.
+    """The training and the validation episodes of a store; where sessions are users, these go on
+    from what the users were shown before.
 
     Without a validation split, every tenth training episode is held out for validation.
 
@@ -64,6 +65,9 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
             "the store so that fewer episodes are held out"
         )
     if validation.n_episodes:
+        if store.has_users and store.record.source.session_by == "user":
+            users = validation.episode_values(schema.USER)
+            validation = UserRows.of(validation, users, train).continue_sessions(None)
         return train, validation
     held_out = np.arange(train.n_episodes) % 10 == 1
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.running import AGES, RunningRates
+from ucfrec.user_model.running import AGES, RunningRates, TimeBins
 
 MEMORY = 50
 """Steps of a session that show tastes, the latest ones."""
@@ -177,7 +177,7 @@ class ItemRewardModel(nn.Module):
         (M, n_items); 0 where items are always available."""
         if offer is None or not len(self.running):
             return torch.zeros(())
-        rates = self.rates or RunningRates(0, 1, self.latest.unsqueeze(0))
+        rates = self.rates or RunningRates(TimeBins(0, 1, 0), self.latest.unsqueeze(0))
         if items is None:
             return rates.sum_all(offer, self.running)
         return rates.inputs(offer, items) @ self.running

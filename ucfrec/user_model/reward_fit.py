@@ -250,7 +250,7 @@ def set_statistics(
     model.rates = RunningRates.of(train, model.target)
     if model.rates is not None:
         last = torch.tensor([train.column(schema.TIMESTAMP).max()])
-        model.latest.copy_(model.rates.rates[model.rates.rows(last)[0]])
+        model.latest.copy_(model.rates.rates[model.rates.bins.rows(last)[0]])
 
 
 def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]) -> _Report:

@@ -65,8 +65,8 @@ def make_log(folder: Path, seed: int = 0, drift: bool = True) -> pd.DataFrame:
     log["rated_at"] = (START + pd.to_timedelta(log.pop("day"), "D")).dt.round("s")
     folder.mkdir(parents=True, exist_ok=True)
     log.to_parquet(folder / "ratings.parquet", index=False)
-    films = {"film": range(FILMS), "genre": [f"genre {number}" for number in genre]}
-    pd.DataFrame(films).to_csv(folder / "films.csv", index=False)
+    columns = {"film": range(FILMS), "genre": [f"genre {number}" for number in genre]}
+    pd.DataFrame(columns).to_csv(folder / "films.csv", index=False)
     return log
 
 

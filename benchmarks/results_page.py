@@ -73,8 +73,8 @@ BASELINES = (
 SEQUENCE = ("sasrec", "gsasrec", "bpr", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
 UCF = (
     *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure", "ucf-wo-reward-weight"),
-    *("ucf-wo-lookahead", "ucf-wo-policy", "ucf-wo-rule", "ucf-weights", "ucf-max-return"),
-    *("ucf-actions", "ucf-both", "ucf-wo-count", "ucf-wo-arch", "ucf"),
+    *("ucf-wo-lookahead", "ucf-wo-policy", "ucf-wo-rule", "ucf-actions", "ucf-both"),
+    *("ucf-wo-count", "ucf-wo-arch", "ucf"),
 )
 METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQUENCE), *UCF)
 """Order of the lines."""
@@ -557,10 +557,9 @@ SECTIONS = (
         spread,
     ),
     Section(
-        "Control: ways to pursue reward",
-        "All without embeddings of time steps: advantage weights, the largest return that the "
-        "policy expects as target, both, and the best quarter of the trajectories. One seed, so a "
-        "difference may be chance. Only the best quarter helps every method.",
+        "Control: the best quarter of the trajectories",
+        "All without embeddings of time steps. Learning from the best quarter alone helps every "
+        "method. One seed, so a difference may be chance.",
         f"`{CONTROL} pursuing`",
         of("control", "pursuing"),
         scores,
@@ -589,7 +588,6 @@ NAMES = (
     ("ucf-screened, -dropped", "interventions on dimensions that screening flags; without them"),
     ("-wo-exposure, -wo-rule", "without exposure features; without a selected rule"),
     ("-actions, -both", "augmented actions; augmented states and actions"),
-    ("-weights, -max-return", "advantage weights; the largest expected return as target"),
     ("bc-10, bc-25", "behaviour cloning of the best 10% or 25% of the episodes"),
     ("-best-25", "trained on the best 25% of the trajectories"),
     ("-wo-time", "without timestep embeddings"),

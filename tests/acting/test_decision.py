@@ -19,7 +19,7 @@ from ucfrec.errors import InputError
 SCORES = torch.tensor([[1.0, 3.0, -math.inf, 2.0], [0.0, 0.0, 5.0, -1.0]])
 rules = st.builds(
     DecisionRule,
-    target=st.one_of(st.none(), st.floats(-1e6, 1e6)),
+    target=st.floats(-1e6, 1e6),
     minimum_target=st.one_of(st.none(), st.floats(-1e6, 1e6)),
     reward_weight=st.floats(0, 100),
     temperature=st.floats(0, 100),
@@ -53,7 +53,7 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
     for same in (DecisionRule(np.float32(5)), DecisionRule(5, reward_weight=-0.0)):
         assert (same, same.hash) == (rule, rule.hash)
     whole = dict.fromkeys(("top_k", "tag_window", "tag_run", "explore_top"), 1)
-    values = whole | {"target": None, "exclude_seen": True, "policy_weight": 0.5}
+    values = whole | {"exclude_seen": True, "policy_weight": 0.5}
     names = (field.name for field in fields(DecisionRule))
     others = [
         DecisionRule(**{"target": 5.0, "explore": 0.5, name: values.get(name, 1.0)})
@@ -65,6 +65,7 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
 
 HOSTILE: dict[str, Any] = {
     "not a number": {"target": "5"},
+    "no target": {"target": None},
     "nan": {"target": math.nan},
     "huge": {"target": 10**400},
     "unknown": {"target": 1.0, "__class__": "x"},
@@ -199,17 +200,13 @@ def test_items_left_out_are_ranked_last_and_good_ones_first(rule: DecisionRule) 
 def test_a_target_is_of_a_session_or_of_every_step() -> None:
     collected = torch.tensor([0.0, 3.0, 9.0]).double()
     session, step = ReturnToGo(), ReturnToGo("horizon", horizon=2)
-    best = torch.tensor([0.5, 1.0, 2.0])
 
-    def targets(returns: ReturnToGo, *rule: float | None) -> Any:
-        return DecisionRule(*rule).target_returns(returns, collected, best).tolist()
+    def targets(returns: ReturnToGo, *rule: float) -> Any:
+        return DecisionRule(*rule).target_returns(returns, collected).tolist()
 
     assert targets(session, 5.0) == [5, 2, -4]
     assert targets(session, 5.0, 1.5) == [5, 2, 1.5]
     assert targets(step, 5.0) == targets(step, 5.0, 1.5) == [5, 5, 5]
-    for returns in (session, step):
-        assert targets(returns, None) == [0.5, 1, 2]
-        assert targets(returns, None, 1.0) == [1, 1, 2]
 
 
 # The best items.

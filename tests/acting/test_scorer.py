@@ -48,14 +48,13 @@ from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 SETTINGS = {
     "train.steps": 30, "train.learning_rate": 3e-3, "policy.dim": 16, "policy.context": 6,
-    "policy.exposure": True, "policy.exposure_window": 4, "policy.advantage_weights": True,
-    "policy.max_return": True, "augment.copies": 0, "rule.choose": False,
+    "policy.exposure": True, "policy.exposure_window": 4,
+    "augment.copies": 0, "rule.choose": False,
 }  # fmt: skip
 RULES = {
     "target": DecisionRule(3.0, temperature=1.0),
     "minimum": DecisionRule(1.0, minimum_target=0.5, temperature=0.7),
     "best": DecisionRule(3.0),
-    "learned": DecisionRule(None, temperature=1.0),
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
     "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
     "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
@@ -217,8 +216,6 @@ def test_vectors_are_predicted_at_the_target() -> None:
     targets = ReturnToGo().before(2.0 - sessions.collected, windows.rewards) * windows.mask
     with torch.no_grad():
         torch.testing.assert_close(found, policy.act(replace(windows, returns_to_go=targets)))
-        with pytest.raises(InputError, match=r"--set policy\.max_return=true"):
-            Scorer(policy, DecisionRule(None)).act(sessions)
 
 
 def test_a_rule_needs_what_it_uses() -> None:
@@ -247,7 +244,7 @@ def last_sessions(log: pd.DataFrame) -> Iterator[tuple[Any, list[int], list[floa
             yield user, latest.item_id.tolist(), latest.reward.tolist()
 
 
-ACTING = [("session", rule) for rule in RULES] + [("horizon", "minimum"), ("horizon", "learned")]
+ACTING = [("session", rule) for rule in RULES] + [("horizon", "minimum")]
 
 
 @pytest.mark.parametrize(("trained", "rule"), ACTING, indirect=["trained"])

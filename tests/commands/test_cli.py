@@ -412,7 +412,7 @@ def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> No
     for more, says in (
         ([run, "--targets", "5,much"], "--targets: 'much' is not a number"),
         ([run, "--temperatures", "1,hot"], "is not a number; write e.g. 0,0.5,1"),
-        ([run, "--target", "much"], "--target much is no number; write e.g. 5, q0.9 or max"),
+        ([run, "--target", "much"], "--target: 'much' is not a number; write e.g. 5 or q0.9"),
         ([], "name a run folder"),
     ):
         assert says in refused(["ope", *more, str(logs)], capsys)

@@ -9,11 +9,10 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from scipy.stats import chisquare
 
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
-from ucfrec.off_policy.ab_test import Comparison, always_valid, compare_arms, find_split_p_value
+from ucfrec.off_policy.ab_test import Comparison, always_valid, compare_arms
 
 
 def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFrame:
@@ -219,16 +218,11 @@ def test_arms_that_lack_users_conclude_nothing(tmp_path: Path) -> None:
     file = tmp_path / "log.parquet"
     log(5000, 0.4).to_parquet(file)
     as_drawn = compare_arms([file], shares={"a": 0.4, "b": 0.1, "c": 0.5})
-    expected = chisquare(as_drawn.in_arm, [4000, 1000]).pvalue
-    assert find_split_p_value(as_drawn.in_arm, 0.8) == pytest.approx(expected)
     assert as_drawn.always.standing() == "better"
     even = compare_arms([file])
     assert "80.0% and 20.0%, where 50.0% and 50.0% were intended (p = 0)" in str(even)
     assert even.conclusion.startswith("nothing can be concluded: sample ratio mismatch")
     assert "b − a: – at a planned end" in str(even)
-    for users in (120, 145, 160):
-        expected = chisquare([users, 100]).pvalue
-        assert find_split_p_value((users, 100), 0.5) == pytest.approx(expected)
     for given, says in (
         *(({"shares": {"a": 0.0, arm: 0.5}}, "give one above 0 to each arm of") for arm in "bc"),
         *(({"expected": wrong}, "give a difference above 0") for wrong in (-1.0, 1e-200, 1e200)),

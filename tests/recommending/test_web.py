@@ -55,7 +55,7 @@ def test_answers_are_those_of_the_command_and_share_passes(
 ) -> None:
     log = histories()
     log.to_parquet(tmp_path / "log.parquet")
-    rule = "--exclude-seen --target max --minimum-target 0.1 --reward-weight 0.7 --tag-window 2"
+    rule = "--exclude-seen --target 2 --minimum-target 0.1 --reward-weight 0.7 --tag-window 2"
     arguments = [str(trained.folder), str(tmp_path / "log.parquet"), *rule.split()]
     assert main(["recommend", *arguments, "--out", str(tmp_path / "out")]) == 0
     by = responder(trained, rule=FULL)

@@ -95,8 +95,8 @@ def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> No
     settings = [
         *("train.steps=4", "train.batch_size=256", "policy.dim=8", "policy.context=4"),
         *("crm.epochs=20", "crm.hidden=16", "augment.actions=2", "augment.epsilon_r=10.0"),
-        *("policy.exposure=true", "policy.advantage_weights=true", "policy.max_return=true"),
-        *("policy.return_to_go=horizon", "policy.horizon=2", "rule.choose=false"),
+        *("policy.exposure=true", "policy.return_to_go=horizon", "policy.horizon=2"),
+        "rule.choose=false",
     ]
     record = train_run(store, tmp_path / "run", resolve_config(policy_name, None, settings))
     assert record.augmentation.actions.copies > 10

@@ -107,7 +107,7 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
 TOGETHER = [
     "train.steps=12", "train.validate_every=4", "train.batch_size=9", "train.warmup_steps=2",
     "train.learning_rate=0.01", "policy.dim=8", "policy.context=3", "policy.dropout=0.0",
-    "policy.advantage_weights=true", "augment.copies=1", "crm.epochs=1", "crm.hidden=8",
+    "augment.copies=1", "crm.epochs=1", "crm.hidden=8",
 ]  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def same(found: Path, expected: Path) -> None:
     """Runs of the same files and curves. Weights without effect, whose gradients are rounding
     errors, differ."""
     curves, others = (read_metrics(run / "policy") for run in (found, expected))
-    for name in ("loss", "validation_loss", "action_loss", "value_loss", "gradient_norm"):
+    for name in ("loss", "validation_loss", "action_loss", "gradient_norm"):
         assert curves[name] == pytest.approx(others[name], rel=1e-4)
     for name in ("best", "last"):
         read = [load_tensors(run / "policy" / f"{name}.safetensors") for run in (found, expected)]

@@ -25,10 +25,10 @@ from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, describe_steps
 
 SETTINGS = [
     *("train.steps=20", "policy.dim=8", "policy.context=4", "augment.copies=0"),
-    *("policy.max_return=true", "rule.sessions=2", "rule.reward_weights=[0.5]"),
+    *("rule.sessions=2", "rule.reward_weights=[0.5]"),
     *("rule.temperatures=[0.0]", "rule.quantiles=[1.0]", "rule.tag_windows=[0]"),
 ]
-FULL = DecisionRule(None, minimum_target=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
+FULL = DecisionRule(2.0, minimum_target=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
 """A rule that uses every part of a policy."""
 OBSERVED = LogMapping({"observation": "observation"})
 """Mapping of logs with observations."""

@@ -42,9 +42,9 @@ class DecisionRule:
         InputError: a value is out of range.
     """
 
-    target: _Return | None
-    """Target return in units of the training reward, of a session or of every step (`ReturnToGo`);
-    None for the largest return that the policy expects in each state."""
+    target: _Return
+    """Target return in units of the training reward, of a session or of every step
+    (`ReturnToGo`)."""
     minimum_target: _Return | None = None
     """Target returns are at least this, also once a session has reached its target; None for no
     minimum."""
@@ -94,11 +94,10 @@ class DecisionRule:
 
     def __str__(self) -> str:
         has_policy = self.policy_weight > 0
-        target = "the largest return expected" if self.target is None else f"{self.target:g}"
         effect = f"{self.policy_weight:g}" if has_policy else "0 (the policy has no effect)"
         among = f"the {self.explore_top} best items" if self.explore_top else "all items"
         parts = {
-            f"target {target}": has_policy,
+            f"target {self.target:g}": has_policy,
             f"at least {self.minimum_target or 0.0:g} at every step": has_policy
             and self.minimum_target is not None,
             f"reward weight {self.reward_weight:g}": self.reward_weight,
@@ -128,23 +127,13 @@ class DecisionRule:
         """12 hexadecimal digits that distinguish rules, for results."""
         return config_hash(self.as_dict())
 
-    def target_returns(
-        self,
-        returns: ReturnToGo,
-        collected: Tensor,
-        best: Tensor | None,
-    ) -> Tensor:
+    def target_returns(self, returns: ReturnToGo, collected: Tensor) -> Tensor:
         """Target returns at the next step, (B,) float64, in reward units.
 
         Args:
             collected: (B,) rewards earlier in the session.
-            best: (B,) the largest returns that the policy expects; needed without a target.
         """
-        if self.target is None:
-            assert best is not None
-            targets = best.double()
-        else:
-            targets = returns.target_returns(self.target, collected)
+        targets = returns.target_returns(self.target, collected)
         return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 
     def log_probabilities(self, scores: Tensor, earlier: Tensor | None = None) -> Tensor:

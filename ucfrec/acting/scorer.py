@@ -193,10 +193,8 @@ class Scorer:
         Args:
             sessions: as of `scores`, or of vector actions with states.
         """
-        best, windows = None, sessions.windows(self.states, self.policy.config.context)
-        if self.rule.target is None:
-            best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
-        targets = self.rule.target_returns(self.returns, sessions.collected, best)
+        windows = sessions.windows(self.states, self.policy.config.context)
+        targets = self.rule.target_returns(self.returns, sessions.collected)
         returns_to_go = self.returns.before(targets, windows.rewards)
         return replace(windows, returns_to_go=returns_to_go.masked_fill(~windows.mask, 0.0))
 

@@ -461,7 +461,7 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """Simulate candidates part by part of the rule, varying the best rule found so far."""
     problem, config = search.problem, search.problem.config
     hottest_first = sorted(config.temperatures, reverse=True)
-    plain = [DecisionRule(None, temperature=temperature) for temperature in hottest_first]
+    plain = [DecisionRule(0.0, temperature=temperature) for temperature in hottest_first]
     candidates = search.simulate([rule for of in plain for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
     # Rules of lists show many items at a low temperature, too: no list repeats an item.
@@ -515,13 +515,10 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
 
 
 def _vary_target(rule: DecisionRule, problem: Problem) -> Iterator[DecisionRule]:
-    """The rule with each target, with and without that minimum, and with the policy's own."""
-    policy = problem.scorer.policy
+    """The rule with each target, with and without that minimum."""
     for target in dict.fromkeys(problem.targets.values()):
         yield replace(rule, target=target, minimum_target=None)
         yield replace(rule, target=target, minimum_target=target)
-    if policy.values is not None and policy.config.max_return:
-        yield replace(rule, target=None, minimum_target=None)
 
 
 def _vary(rule: DecisionRule, **values: Sequence[Any]) -> list[DecisionRule]:

@@ -8,8 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ucfrec.commands.options import OUTPUT, POSITIVE, Group, settings_given
-from ucfrec.commands.shared_options import LogOptions, RuleOptions, RunArgument, find_runs
-from ucfrec.errors import InputError
+from ucfrec.commands.shared_options import (
+    LogOptions,
+    RuleOptions,
+    RunArgument,
+    find_runs,
+    read_number,
+    read_target,
+)
 from ucfrec.files.remote import origin
 
 if TYPE_CHECKING:
@@ -122,10 +128,11 @@ class Ope(RuleOptions, LogOptions):
         base = self.make_rule(trained)
         targets, temperatures = [base.target], [base.temperature]
         if self.targets is not None:
-            targets = [_read_target(part.strip(), trained) for part in self.targets.split(",")]
+            words = map(str.strip, self.targets.split(","))
+            targets = [read_target("--targets", word, trained) for word in words]
         if self.temperatures is not None:
             temperatures = [
-                _read_number("--temperatures", part, "0,0.5,1")
+                read_number("--temperatures", part, "0,0.5,1")
                 for part in self.temperatures.split(",")
             ]
         rules = [
@@ -185,19 +192,6 @@ def _describe_choice(choice: "Selection") -> str:
         lines.append("value per session, with a 95% band that holds all of them at once:")
         lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))
     return "\n".join(lines)
-
-
-def _read_target(part: str, trained: "TrainedPolicy") -> float:
-    """A target return: a number in units of the reward, or `q` and a quantile."""
-    value = _read_number("--targets", part.removeprefix("q"), "5,10 or q0.5,q0.9")
-    return trained.target_return(value) if part.startswith("q") else value
-
-
-def _read_number(option: str, word: str, example: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise InputError(f"{option}: {word!r} is not a number; write e.g. {example}") from None
 
 
 class Score(RuleOptions, LogOptions, RunArgument):

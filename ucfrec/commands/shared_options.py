@@ -145,7 +145,7 @@ class RuleOptions(Table):
     """Weights of the lowest validation loss or the last ones, for runs without a refit"""
     target: str | None = None
     """Target return, in units of the reward, of a session; of every step with a horizon or
-    discount; q0.9 for a quantile of the training's, max for the largest that the policy expects"""
+    discount; q0.9 for a quantile of the training's"""
     minimum_target: float | None = None
     reward_weight: float | None = None
     policy_weight: float | None = None
@@ -176,19 +176,22 @@ class RuleOptions(Table):
 
         parts = settings_given(self, DecisionRule)
         if self.target:
-            parts["target"] = read_target(self.target, trained)
+            parts["target"] = read_target("--target", self.target, trained)
         return replace(trained.rule, **parts)
 
 
-def read_target(text: str, trained: "TrainedPolicy") -> float | None:
-    """The target return that `--target` names; None for the largest that the policy expects."""
-    if text == "max":
-        return None
-    try:
-        value = float(text.removeprefix("q"))
-    except ValueError:
-        raise InputError(f"--target {text} is no number; write e.g. 5, q0.9 or max") from None
+def read_target(option: str, text: str, trained: "TrainedPolicy") -> float:
+    """The target return that an option names: in units of the reward, or `q` and a quantile."""
+    value = read_number(option, text.removeprefix("q"), "5 or q0.9")
     return trained.target_return(value) if text.startswith("q") else value
+
+
+def read_number(option: str, word: str, example: str) -> float:
+    """The number that an option holds, or an error with an example of one."""
+    try:
+        return float(word)
+    except ValueError:
+        raise InputError(f"{option}: {word!r} is not a number; write e.g. {example}") from None
 
 
 def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:

@@ -132,8 +132,7 @@ class Explorer:
         trained, rule, states = self.runs[0], self.runs[0].rule, self.runs[0].item_states
         lowest, highest = float(trained.training_returns[0]), float(trained.training_returns[-1])
         span = max(highest - lowest, abs(highest), 1e-6)
-        target = highest if rule.target is None else rule.target
-        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100, target)]
+        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100, rule.target)]
         if trained.reward_model is not None:
             sliders.append(("reward_weight", "Reward weight", 0, 32, 0.25, rule.reward_weight))
         sliders.append(("temperature", "Temperature", 0, 2, 0.05, rule.temperature))

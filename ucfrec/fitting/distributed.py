@@ -113,16 +113,6 @@ def joint_means(means: Mapping[str, float], count: float) -> dict[str, float]:
     )
 
 
-def joint_moments(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of values (M,), of those of all processes together."""
-    if processes() == 1:
-        return values.mean(), values.std(correction=0)
-    parts = torch.stack([values.new_tensor(len(values)), values.sum(), values.square().sum()])
-    distributed.all_reduce(parts)
-    mean = parts[1] / parts[0]
-    return mean, (parts[2] / parts[0] - mean.square()).clamp(min=0).sqrt()
-
-
 def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
     """Replace gradients, of the same layout everywhere, by their means over all processes.
 

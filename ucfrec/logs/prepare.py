@@ -274,7 +274,7 @@ def read_log(
                 counts = sessions.count_steps(rows, cut)
                 stage.update()
                 features = {
-                    name: load_features(connection, tables, name, log.id_type(name))
+                    name: load_features(connection, tables, name, log.find_type(name))
                     for name, tables in tables_of_ids.items()
                     if name in log.columns
                 }

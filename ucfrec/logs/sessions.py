@@ -329,7 +329,7 @@ def number_ids(
     for name, table, file in ID_TABLES:
         if name not in log.columns:
             continue
-        kind = log.id_type(name)
+        kind = log.find_type(name)
         old = f"SELECT NULL::{kind} AS {name}, 0 AS number, 0 AS train_count WHERE false"
         if store is not None:
             # Ids may be integers in the store and text in the log, or vice versa: 07 is not 7.

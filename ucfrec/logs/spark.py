@@ -62,19 +62,8 @@ MEMORY = "2GB"
 """Memory of the process of a task."""
 PART_ROWS = 1_000_000
 """About so many rows are a part; a user's rows are never in two."""
-_TYPES = {
-    "BIGINT": "bigint",
-    "VARCHAR": "string",
-    schema.ACTION: "array<float>",
-    schema.TIMESTAMP: "bigint",
-    schema.OBSERVATION: "array<float>",
-    schema.PROPENSITY: "float",
-    schema.IS_RANDOM: "boolean",
-    schema.POSITION: "double",
-    schema.SESSION_BEGAN: "bigint",
-    schema.EXCLUDES_SEEN: "boolean",
-}
-"""DuckDB type of an id, or another log column, to Spark's type."""
+_SPARK_TYPES = {"VARCHAR": "string", "FLOAT[]": "array<float>"}
+"""Spark's names of types that it does not call as DuckDB does."""
 _SORTED = "sorted"
 _REFUSED = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
 
@@ -167,7 +156,8 @@ def _type_rows(
         query = f"SELECT * REPLACE (row + {rows_before} AS row) FROM ({faulty})"
         tasks.append(Task(file, query, () if known_items is None else (known_items,)))
         rows_before += sum(row["n"] for row in survey if row["file"] == number)
-    types = {n: _TYPES[n if n in _TYPES else log.id_type(n)] for n in log.columns}
+    kinds = {name: log.find_type(name) for name in log.columns}
+    types = {name: _SPARK_TYPES.get(kind, kind.lower()) for name, kind in kinds.items()}
     types = {"row": "bigint", **types, schema.REWARD: "double"}
     types |= {"action_hash": "bigint"} if schema.ACTION in types else {}
     types |= {"fault": "smallint"}

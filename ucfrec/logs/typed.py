@@ -129,8 +129,8 @@ class TypedLog:
         """The first file, and how many more there are, for messages."""
         return first_and_more([file for table in self.tables for file in table.files])
 
-    def id_type(self, name: str) -> str:
-        """DuckDB type of an id column: BIGINT or VARCHAR."""
+    def find_type(self, name: str) -> str:
+        """DuckDB type of a column, of ids BIGINT or VARCHAR."""
         return str(self.one(f"DESCRIBE SELECT {name} FROM {ROWS}")[1])
 
     def one(self, sql: str) -> tuple[Any, ...]:

@@ -103,14 +103,6 @@ class Comparison:
         return f"{says}, but a guardrail is {'broken' if 'broken' in outcomes else 'open'}"
 
 
-def find_split_p_value(users: tuple[int, int], share: float) -> float:
-    """The p-value of the χ² test that so many users were drawn into two arms, the first with a
-    probability of `share`."""
-    expected = sum(users) * share
-    off = (users[0] - expected) ** 2 / (expected * (1 - share))
-    return math.erfc(math.sqrt(off / 2))
-
-
 def always_valid(
     difference: float, variance: float, expected: float, miss: float = MISS
 ) -> tuple[float, float]:
@@ -284,7 +276,10 @@ def _compare_parts(
 
 def _doubt_split(users: tuple[int, int], share: float) -> list[str]:
     """Why a difference may be one of the users (Fabijan et al., KDD 2019), if it may."""
-    p_value, total = find_split_p_value(users, share), sum(users)
+    from scipy.stats import chisquare  # takes a moment to import
+
+    total = sum(users)
+    p_value = float(chisquare(users, [total * share, total * (1 - share)]).pvalue)
     if p_value >= MISMATCH:
         return []
     return [

@@ -164,8 +164,6 @@ def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
     ] or list(candidates[0])[:1]
 
     def describe(key: str, value: object, digits: int) -> str:
-        if value is None:
-            return f"largest {key} expected"
         return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)
 
     short, full = (

@@ -1,4 +1,4 @@
-"""Base of all sequence policies: configuration, normalisation, action loss, state values."""
+"""Base of all sequence policies: configuration, normalisation, action loss."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -10,14 +10,12 @@ import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from ucfrec.episodes.exposure import ExposureTerm, Likeness
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
-from ucfrec.fitting.distributed import joint_moments
 from ucfrec.policies.heads import Head, ItemHead, VectorHead
 from ucfrec.settings import Dropout, Width, require, settings_table
 
@@ -25,8 +23,6 @@ _CLIP = 10.0
 """Standardised states beyond this many standard deviations are clipped."""
 _KNOTS = 6
 """Returns-to-go at which an exposure term has weights of its own."""
-BEST: float = 0.99
-"""τ of the expectile that stands for the best return within the logs (Reinformer)."""
 
 Context = Annotated[int, Field(ge=1, le=4096)]
 Layers = Annotated[int, Field(ge=1, le=128)]
@@ -61,11 +57,6 @@ class PolicyConfig:
     on shared tags or, without tags, on similar embeddings."""
     exposure_window: Annotated[int, Field(ge=1, le=1000)] = 10
     """Earlier steps that count as lately, as far as `context` reaches."""
-    advantage_weights: bool = False
-    """Whether steps count in the loss by exp((Ĝ − V(s)) / σ), instead of all alike."""
-    max_return: bool = False
-    """Whether the largest return to expect after a history is learned, which decision rules can
-    take for the target return."""
     best_share: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the training episodes to learn from, those with the highest returns; for `bc`, 0.1
     is the 10% BC of Chen et al. (2021)."""
@@ -128,8 +119,6 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
         self.head = _new_head(config, sizes)
-        learns_values = config.advantage_weights or config.max_return
-        self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 
     @classmethod
     def training_view(
@@ -196,8 +185,7 @@ class SequencePolicy(nn.Module, ABC):
         return self.imitation(self.features(normalized), normalized)
 
     def imitation(self, features: Tensor, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Action loss over all steps of normalised windows with features (B, K, d), plus the loss
-        of the state values if there are any."""
+        """Action loss over all steps of normalised windows with features (B, K, d)."""
         padded = some_padding(windows.decided)
         exposed = self.exposed(windows, padded)
 
@@ -205,16 +193,8 @@ class SequencePolicy(nn.Module, ABC):
             return values.flatten(0, 1) if padded is None else values[padded]
 
         losses = self.head.losses(steps(features), steps(windows.actions), exposed)
-        if self.values is None:
-            value = losses.mean()
-            return value, {"action_loss": value.detach()}
-        values = steps(self.values(windows, self.head.embed(windows.actions)))
-        returns = steps(windows.returns_to_go)
-        if self.config.advantage_weights:
-            losses = losses * advantage_weights(values, returns)
-        action_loss, value_loss = losses.mean(), self.values.loss(values, returns)
-        scalars = {"action_loss": action_loss.detach(), "value_loss": value_loss.detach()}
-        return action_loss + value_loss, scalars
+        value = losses.mean()
+        return value, {"action_loss": value.detach()}
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
@@ -232,18 +212,6 @@ class SequencePolicy(nn.Module, ABC):
         normalized = self.normalize(windows)
         features, exposed = self.last_features(normalized), self.exposed(normalized, last=True)
         return self.head.predict(features, exposed), features
-
-    def max_return(self, windows: Windows) -> Tensor:
-        """The largest return-to-go to expect at the last step, (B,) in reward units; an InputError
-        if the policy was trained without `policy.max_return`."""
-        if self.values is None:
-            raise InputError(
-                "the policy does not know its largest return; train it with "
-                "--set policy.max_return=true, or give a target return"
-            )
-        normalized = self.normalize(windows)
-        best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
-        return best * self.return_scale
 
     def exposed(
         self,
@@ -332,48 +300,3 @@ def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
         return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
 
     return roll(network(roll(inputs, padding))[0], -padding)
-
-
-class ValueHead(nn.Module):
-    """V(h_t), the mean of the return-to-go Ĝ_t, and V_τ(h_t), its expectile at τ = `BEST`.
-
-    The history h_t is what the policy sees but the returns-to-go: states and step numbers up to t
-    and actions before t, within the context. The expectile minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²]
-    (Zhuang et al., ICML 2024). Values are in units of the policy's return scale.
-    """
-
-    def __init__(self, state_size: int, dim: int) -> None:
-        super().__init__()
-        self.embed = nn.Linear(state_size + 1 + dim, dim)
-        self.history = nn.GRU(dim, dim, batch_first=True)
-        self.out = nn.Sequential(
-            nn.Linear(dim, dim),
-            nn.ReLU(),
-            nn.Linear(dim, 2),
-        )
-
-    def forward(self, windows: Windows, actions: Tensor) -> Tensor:
-        """Mean and expectile (B, K, 2), of normalised windows and their embedded actions (B, K, d),
-        into which no gradient goes."""
-        mask = windows.mask
-        time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
-        actions = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
-        earlier = F.pad(actions, (0, 0, 1, 0))[:, :-1]
-        tokens = F.relu(self.embed(torch.cat([windows.states, time, earlier], dim=-1)))
-        return self.out(recurrent(self.history, tokens, mask))  # type: ignore[no-any-return]
-
-    @staticmethod
-    def loss(values: Tensor, returns: Tensor) -> Tensor:
-        """Squared error of the mean plus the expectile's, values (M, 2), to returns-to-go (M,)."""
-        error = returns - values[:, 1]
-        slope = torch.where(error < 0, 1 - BEST, BEST)
-        return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
-
-
-def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
-    """exp(clip((Ĝ_t − V(s_t)) / σ, −5, 3)) of M steps, (M,), σ the advantages' standard deviation,
-    from values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over processes."""
-    advantage = (returns - values[:, 0]).detach()
-    deviation = joint_moments(advantage)[1].clamp(min=1e-6)
-    weights = (advantage / deviation).clamp(-5.0, 3.0).exp()
-    return weights / joint_moments(weights)[0]

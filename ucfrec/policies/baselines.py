@@ -91,8 +91,8 @@ class PopularPolicy(ScoringPolicy):
 
     The score is the logarithm of the item's share of all `steps`, one step added to each item; the
     logarithm of its share of the `likes`; or the log-odds of its `rate` of liked steps. For action
-    vectors, it is the mean logged action. Only the components of the head that settings switch on
-    (exposure, values) are learned by gradient, and only by shares of steps.
+    vectors, it is the mean logged action. Only an exposure term is learned by gradient, and only by
+    shares of steps.
 
     With a half-life, a row that is h half-lives older than the last training row counts 2^−h.
     """
@@ -116,7 +116,7 @@ class PopularPolicy(ScoringPolicy):
         config = self.config
         if self.scored_by != "steps":
             return lambda: self._set_scores(train, validation)
-        if config.exposure or config.advantage_weights or config.max_return:
+        if config.exposure:
             return None
         return lambda: self._set_mean(train)
 

@@ -16,8 +16,8 @@ from ucfrec.policies.heads import ItemHead
 from ucfrec.processes import random_state_kept
 
 RESERVED = frozenset(
-    {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "values", "head"}
-    | {"normalize", "imitation", "act_and_features", "max_return", "exposed"}
+    {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "head"}
+    | {"normalize", "imitation", "act_and_features", "exposed"}
 )
 """Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
 by another with the same methods."""

@@ -1,7 +1,6 @@
 """Result rows of a control cell: a training and the scores of its policy."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -46,12 +45,9 @@ def rl_config_of(cell: Cell) -> RLConfig:
 
 
 def evaluate(cell: Cell, **how: Any) -> list[ResultRow]:
-    """Evaluate the run of the cell at the target returns of the preset, or the first; at the
-    policy's own if it knows it."""
+    """Evaluate the run of the cell at the target returns of the preset, or the first."""
     assert cell.run is not None
-    targets: Sequence[float] = ()
-    if cell.policy in ALGORITHMS or not cell.config.policy.max_return:
-        targets = preset_of(dataset_of(open_store(cell)), cell.policy).targets
+    targets = preset_of(dataset_of(open_store(cell)), cell.policy).targets
     if not cell.evaluation.all_targets:
         targets = targets[:1]
     episodes, seed = cell.evaluation.episodes, cell.evaluation.seed

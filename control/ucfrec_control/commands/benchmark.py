@@ -26,8 +26,8 @@ class Benchmark(SuiteOptions):
     """`ucfrec-control benchmark`."""
 
     table: Annotated[str, Names(lambda: tuple(TABLES), closed=True)] = MAIN
-    """Every method (main), ways to pursue reward, all trained for as long as DT or LSDT
-    (equal-time), or a sweep over UCF's settings"""
+    """Every method (main), learning from the best quarter of the trajectories (pursuing), all
+    trained for as long as DT or LSDT (equal-time), or a sweep over UCF's settings"""
 
     def execute(self) -> None:
         """Run `ucfrec-control benchmark`."""

@@ -10,8 +10,8 @@ from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow, write_results
-from ucfrec_control.commands.options import MAX_RETURN, target_given
-from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run, takes_target
+from ucfrec_control.commands.options import target_given
+from ucfrec_control.training.evaluate import CHECKPOINTS, evaluate_run, takes_target
 from ucfrec_control.training.rl_baselines import read_run
 from ucfrec_control.training.video import record_episode
 
@@ -32,9 +32,8 @@ class Evaluate(Table):
     """Episodes of each policy and target."""
     seed: Annotated[int, SEED] = 0
     """Of the episodes."""
-    target: Annotated[Sequence[float | None], target_given] = ()
-    """Target return, or max for the largest that the policy expects in each state; repeatable
-    (default: the preset's, else the largest of the training)"""
+    target: Annotated[Sequence[float], target_given] = ()
+    """Target return; repeatable (default: the preset's, else the largest of the training)"""
     checkpoint: Literal["both", "best", "last", "return"] = "both"
     """Weights to evaluate."""
     distractor: float = 0.0
@@ -97,15 +96,12 @@ def _shown(row: ResultRow) -> dict[str, Any]:
     """A row with its score or return, interval and target as text."""
     low, high = row.interval or (row.value, row.value)
     value = {row.metric: f"{row.value:.1f} [{low:.1f}, {high:.1f}]"}
-    target = "none" if row.rule == NO_TARGET else MAX_RETURN
-    if row.target_return is not None:
-        target = f"{row.target_return:g}"
     return {
         **dict.fromkeys(SHOWN),
         **row.as_line(),
         "dataset": row.task,
         "seed": row.training_seed,
-        "target_return": target,
+        "target_return": "none" if row.target_return is None else f"{row.target_return:g}",
         "return": f"{row.metrics['return']:.1f}",
         **value,
     }

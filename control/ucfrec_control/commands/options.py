@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.benchmark.grid import run_grid
@@ -21,24 +21,19 @@ from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
 
-MAX_RETURN: Final = "max"
-"""`--target` for the largest return that the policy expects in each state."""
 
-
-def target_given(text: str) -> float | None:
-    """The value of `--target`: a number, or None for `MAX_RETURN`.
+def target_given(text: str) -> float:
+    """The value of `--target`.
 
     Raises:
-        ArgumentTypeError: `text` is neither.
+        ArgumentTypeError: `text` is no finite number.
     """
-    if text == MAX_RETURN:
-        return None
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text:.40} is no target; give a number or {MAX_RETURN}")
+        raise argparse.ArgumentTypeError(f"{text:.40} is no target; give a number")
     return value
 
 

@@ -45,7 +45,7 @@ def evaluate_run(
     episodes: int,
     seed: int,
     env_id: str | None = None,
-    targets: Sequence[float | None] = (),
+    targets: Sequence[float] = (),
     checkpoints: Sequence[str] = CHECKPOINTS,
     distractor: float = 0.0,
     reference: tuple[float, float] | None = None,
@@ -59,9 +59,7 @@ def evaluate_run(
     Args:
         seed: of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
-        targets: target returns, None for the largest that the policy expects in each state; empty
-            for those of the preset, else the run's own, or the largest expected if the policy was
-            trained to know it.
+        targets: target returns; empty for those of the preset, else the run's own.
         checkpoints: of "last", "best" and, where the training selected by return, "return".
         distractor: value that every distractor is fixed to (Appendix G.4: 0).
         reference: returns with scores 0 and 100; None for D4RL's of the task, if there are any.
@@ -163,7 +161,7 @@ def takes_target(record: RunRecord | RLRecord) -> bool:
 
 
 def rules_of(
-    trained: Trained, env_id: str | None, targets: Sequence[float | None] = ()
+    trained: Trained, env_id: str | None, targets: Sequence[float] = ()
 ) -> Sequence[DecisionRule | None]:
     """The target returns given, else those of the preset, as rules, else the run's own rule;
     (None,) for policies without a target return."""
@@ -172,9 +170,8 @@ def rules_of(
         return (None,)
     name, kind = dataset["dataset"], find_kind(dataset["dataset"])
     task = find_task(env_id or dataset["env_id"], name)
-    preset = find_preset(task.name if task else "", kind, method).targets
-    default = (None,) if trained.policy.config.max_return else preset
-    return [DecisionRule(target) for target in targets or default] or [trained.rule]
+    targets = targets or find_preset(task.name if task else "", kind, method).targets
+    return [DecisionRule(target) for target in targets] or [trained.rule]
 
 
 def play(

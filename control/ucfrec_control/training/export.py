@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
@@ -40,9 +39,8 @@ _COMPARED: Final = 64
 class WindowGraph(nn.Module):
     """The next action from the last K steps of an episode."""
 
-    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None) -> None:
+    def __init__(self, trained: TrainedPolicy) -> None:
         super().__init__()
-        self.expects_best = rule is not None and rule.target is None
         record = trained.record
         self.policy, self.returns = trained.policy, record.return_to_go
         observed = np.arange(trained.logged_observation_size)
@@ -63,8 +61,6 @@ class WindowGraph(nn.Module):
         numbers = steps.unsqueeze(1) + torch.arange(1 - observations.shape[1], 1)
         states = observations.index_select(2, self.get_buffer("seen"))
         windows = Windows.of(numbers, states, actions, rewards)
-        if self.expects_best:
-            target_return = self.policy.max_return(windows)
         returns_to_go = self.returns.before(target_return, windows.rewards)
         returns_to_go = returns_to_go.masked_fill(~windows.mask, 0.0)
         return self.policy.act(replace(windows, returns_to_go=returns_to_go))
@@ -85,7 +81,7 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
         raise InputError(f"{run} is of IQL or CQL; export it with d3rlpy, or {_REMEDY}")
     (rule, *_) = rules_of(trained, None)
     require_installed()
-    graph = WindowGraph(trained, rule).eval()
+    graph = WindowGraph(trained).eval()
     arguments, batch = _draw_windows(graph, trained, 3), torch.export.Dim("batch", min=1, max=2**20)
     shapes = {name: {0: batch} for name in arguments}
     with atomic_folder(out) as scratch:

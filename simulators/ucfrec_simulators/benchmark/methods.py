@@ -77,8 +77,6 @@ COMPONENTS: Final[Mapping[str, Method]] = {
     "ucf-wo-lookahead": make_augmented_ucf("rule.lookaheads=[0]", vectors=False),
     "ucf-wo-policy": make_augmented_ucf("rule.policy_weights=[0]", vectors=False),
     "ucf-wo-rule": make_augmented_ucf("rule.choose=false", vectors=False),
-    "ucf-weights": make_augmented_ucf("policy.advantage_weights=true"),
-    "ucf-max-return": make_augmented_ucf("policy.max_return=true"),
     "ucf-actions": Method("ucf", ("augment.actions=2",), vectors=False),
     "ucf-both": make_augmented_ucf("augment.actions=2", vectors=False),
 }

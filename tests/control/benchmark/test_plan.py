@@ -85,8 +85,6 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         config, policy = pursuing[name], pursuing[name].policy
         assert policy.max_timestep == 1
         assert policy.best_share == (0.25 if "-best-25" in name else 1.0)
-        assert policy.advantage_weights == name.endswith(("-weights", "-both"))
-        assert policy.max_return == name.endswith(("-max-return", "-both"))
         assert (config.augment.copies > 0) == (name.startswith("ucf") and "-wo-count" not in name)
 
 

@@ -45,7 +45,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, policy, settings in (
         ("ucf", "ucf", TINY),
         ("bc", "bc", TINY[:3]),
-        ("best", "dt", (*TINY, "policy.max_return=true")),
     ):
         where = (made / "store", "--out", made / name, "--policy", policy)
         said = control("train", *where, *set_options(settings))[0]
@@ -71,7 +70,7 @@ def play(policy: ControlPolicy, steps: int) -> tuple[Steps, Steps, list[float]]:
     return observations, actions, rewards
 
 
-@pytest.mark.parametrize("name", ["ucf", "bc", pytest.param("best", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ucf", "bc"])
 def test_onnxruntime_acts_as_python_does(folder: Path, tmp_path: Path, name: str) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs ucfrec[export]")
     control("export", folder / name, "--out", tmp_path / "graph")

@@ -22,7 +22,7 @@ from ucfrec.acting.rollout import Episodes, Step, Uniform, rollout
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
-from ucfrec.fitting.checkpoint import load_tensors, read_metrics
+from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.results.rows import read_results, read_rows
 from ucfrec.runs.config import resolve_config
@@ -120,22 +120,6 @@ def test_the_weights_of_the_highest_validation_return_are_kept(
     control("evaluate", tmp_path / "run", *asked)
     assert {row.checkpoint for row in read_results(out)} == {"return"}
     assert "return.safetensors does not exist" in refused("evaluate", folder / "store-run", *asked)
-
-
-def test_policies_that_know_their_return_are_asked_for(store: EpisodeStore, tmp_path: Path) -> None:
-    pursue = ["policy.advantage_weights=true", "policy.max_return=true", "policy.best_share=0.5"]
-    own = {"lsdt": ["policy.kernel_groups=4"], "ucf": ["crm.epochs=1", "csg.epochs=1"]}
-    for policy_name in ("dt", "dc", "lsdt", "ucf"):
-        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(policy_name, [])]
-        run = tmp_path / policy_name
-        train_control(store, run, resolve_config(policy_name, None, settings))
-        assert read_metrics(run / "policy")["value_loss"]
-        (row,) = evaluate_run(run, episodes=1, seed=0, checkpoints=("last",))
-        assert row["target_return"] is None
-        assert "largest return expected" in row["rule"]
-        (given,) = evaluate_run(run, episodes=1, seed=0, targets=(5.0,), checkpoints=("last",))
-        assert given["target_return"] == 5.0
-    assert " max " in control("evaluate", run, *LAST)[0]
 
 
 def test_presets_are_those_of_the_papers() -> None:

@@ -11,7 +11,6 @@ clicks=("clicks/$day.parquet")
 next="clicks/$(date -u -d "$day + 1 day" +%F).parquet"
 [ -e "$next" ] && clicks+=("$next")
 ucfrec join "$shown" "${clicks[@]}" --within 30m --out "logs/$day.parquet"
-# The server excludes items that users have seen.
 ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --out "$new"
 ucfrec report "$new" --out "$new.html"
 ucfrec promote "$new"

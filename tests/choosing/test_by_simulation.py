@@ -282,6 +282,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert record.reward_model is not None
     assert record.rule is not None
     assert record.reward_model.new_users
+    assert any("new" in doubt for doubt in record.rule.estimate.doubts)
     # Nothing that acts knows these tastes.
     trained = TrainedPolicy.load(tmp_path / "run")
     model = trained.reward_model

@@ -38,8 +38,7 @@ _LOGGED_STEPS = 10_000, 1000
 _FINALISTS = 8
 """Rules that are simulated again where users differ in their tastes, …"""
 _TIMES = 4
-"""… in so many times the sessions, as either half of an estimate is: few sessions say as much of
-the users as of the rules."""
+"""… in so many times the sessions, as a half of an estimate: few show users more than rules."""
 _FEWEST = 10
 """Sessions of a half of the users that can disagree, and that can rule a candidate out."""
 _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
@@ -415,6 +414,8 @@ class RuleSearch:
             doubts.append("the log has rows without propensities, whose policy may have known more")
         elif counts.min() < _FEWEST_STEPS:
             doubts.append(f"only {counts.min():.0f} effective logged steps are like its own")
+        if self.users.reward_report.new_users:
+            doubts.append("its users are new, and the log shows only some of what others like")
         length = max(float(half.lengths.mean()) for half in halves)
         if length > (longest := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")

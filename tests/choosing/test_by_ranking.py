@@ -203,10 +203,14 @@ def test_only_rules_that_the_log_can_evaluate_are_chosen(evident: Path) -> None:
     assert "too small to evaluate" in choose_by_simulation(problem(evident, 10**6))[0].warning
 
 
-def test_the_card_has_the_estimate_of_the_rule_and_its_optimism(evident: Path) -> None:
+def test_the_card_has_the_estimate_of_the_rule_or_why_there_is_none(evident: Path) -> None:
     record = RunRecord.read(evident / "run")
     assert record.rule is not None
-    parts = describe_user_model(record)
-    assert record.rule.estimate is not None
-    assert str(parts["estimated value"]).startswith(f"{record.rule.estimate.value:.4g} ±")
-    assert "±" in str(parts["rewards expected too high by"])
+    estimate = record.rule.estimate
+    assert estimate is not None
+    for doubts in ((), ("it is too small",)):
+        rule = record.rule.model_copy(update={"estimate": replace(estimate, doubts=doubts)})
+        parts = describe_user_model(record.copy_with(rule=rule))
+        value = f"{estimate.value:.4g} ± {estimate.error:.2g}"
+        assert parts.get("estimated value") == (None if doubts else value)
+        assert parts.get("value is not estimated, as") == (doubts[0] if doubts else None)

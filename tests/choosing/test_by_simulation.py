@@ -17,6 +17,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import (
     Outcomes,
     RuleSearch,
+    _correct,
     _warning,
     choose_by_simulation,
     find_neighbours,
@@ -98,13 +99,15 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(trained: TrainedPolic
     own = next(each for each in candidates if each["rule"] == rule["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < 2
     assert found.rule is not None
-    assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
     estimate = found.rule.estimate
     assert estimate is not None
     assert estimate.value == pytest.approx(sum(estimate.halves) / 2)
     assert estimate.error >= abs(estimate.halves[0] - estimate.halves[1]) / 2
-    assert any("no propensities" in doubt for doubt in estimate.doubts)
-    assert "WARNING: it cannot be trusted: the log has no propensities" in found.describe()
+    text, value = found.describe(), f"session: {estimate.value:.4g} ± {estimate.error:.2g}"
+    assert "Its return is not estimated: the log has rows without propensities" in text
+    assert value not in text
+    trusted = found.rule.model_copy(update={"estimate": replace(estimate, doubts=())})
+    assert value in found.copy_with(rule=trusted).describe()
 
 
 def test_rules_side_by_side_do_what_each_does_alone(trained: TrainedPolicy) -> None:
@@ -142,10 +145,10 @@ def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> No
     found = search.simulate(rules)
     luck, nothing = np.random.default_rng(0).normal(50.0, 20.0, 40), np.zeros(0, dtype=np.int64)
     for rule, more in zip(rules, (0.0, 3.0), strict=True):
-        search._sessions[rule] = Outcomes(luck + more, nothing, nothing)
+        search._sessions[rule] = Outcomes(luck + more, nothing, nothing, luck)
     low, high = replace(found[0], value=luck.mean()), replace(found[1], value=luck.mean() + 3.0)
     assert search.level([low, high]) == [high]
-    search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
+    search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing, luck)
     assert search.level([low, high]) == [low, high]
     # Of these, the simplest: the higher temperature, whatever comes first.
     assert search.best([low, high]) == search.best([high, low]) == high
@@ -223,6 +226,24 @@ def test_a_policy_below_the_log_is_warned_of(trained: TrainedPolicy) -> None:
         assert (f"less than logged sessions have, {logged:.4g}" in warning) == below
 
 
+def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> None:
+    rng, nothing = np.random.default_rng(0), np.zeros(0, dtype=np.int64)
+    simulated = Outcomes(np.zeros(50), nothing, nothing, rng.uniform(0.6, 0.9, 250))
+    results = []
+    for _ in range(100):
+        # Of what is promising, half of the logged steps have less; the log rarely shows these.
+        expected, poor = rng.random(4000), rng.random(4000) < 0.5
+        gains, weights = np.where((expected > 0.5) & poor, -0.2, 0.0), np.where(poor, 4.0, 1.0)
+        results.append(_correct(simulated, expected, gains, weights))
+    values, errors, steps = np.transpose(results)
+    assert values.mean() == pytest.approx(5 * -0.2 * 0.8, abs=0.005)
+    assert errors.mean() == pytest.approx(values.std(), rel=0.2)
+    assert ((steps > 0.6 * 1200) & (steps < 1200)).all()
+    # Nothing that the log shows promises as much as a part of the simulated steps.
+    low = expected < 0.8
+    assert _correct(simulated, expected[low], gains[low], weights[low]) == (0.0, 0.0, 0.0)
+
+
 @pytest.mark.slow
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
@@ -261,6 +282,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert record.reward_model is not None
     assert record.rule is not None
     assert record.reward_model.new_users
+    assert any("new" in doubt for doubt in record.rule.estimate.doubts)
     # Nothing that acts knows these tastes.
     trained = TrainedPolicy.load(tmp_path / "run")
     model = trained.reward_model

@@ -19,7 +19,7 @@ from ucfrec.user_model.reward_effects import fit_effects
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_report import (
     RewardRows,
-    UserCalibration,
+    calibrate,
     calibration_error,
     score_rows,
 )
@@ -149,7 +149,7 @@ def test_for_new_users_the_session_tells_what_effects_of_users_tell(tmp_path: Pa
     assert not model.affinity.any()
     assert model.reach == MEMORY
     rows = RewardRows.of(store.split("validation"), model.reach, 10**6, 0)
-    slope, intercept = UserCalibration.fit(model, store.split("validation"), 10**6, 0).line
+    slope, intercept = calibrate(model, store.split("validation"), 10**6, 0)
     assert 0.85 < slope < 1.15
     assert abs(intercept) < 0.3
     # After ten steps, the session shows what its user likes, which the log never says.

@@ -28,16 +28,17 @@ from ucfrec.choosing.choice import Problem, RuleChoice, RuleRecord, SimulatedRul
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.processes import progress
-from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
+from ucfrec.results.statistics import effective_number
+from ucfrec.user_model.model import UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
-from ucfrec.user_model.reward_report import number_users
+from ucfrec.user_model.reward_report import number_users, read_propensities
 
 _LOGGED_STEPS = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
 _FINALISTS = 8
 """Rules that are simulated again where users differ in their tastes, …"""
 _TIMES = 4
-"""… in so many times the sessions: few sessions there say as much of the users as of the rules."""
+"""… in so many times the sessions, as a half of an estimate: few show users more than rules."""
 _FEWEST = 10
 """Sessions of a half of the users that can disagree, and that can rule a candidate out."""
 _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
@@ -46,9 +47,11 @@ best are ruled out."""
 _SEED_OF_REST = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
 _FAR_OFF = 0.1
-"""Share of the estimated value by which it may be off and still be trusted."""
-_LARGEST_ERROR = _FAR_OFF / 4
-"""Standard error, as a share of the estimated value, above which more sessions are simulated."""
+"""Share by which an estimated value may be off, and half of that by which the user model may."""
+_FEWEST_STEPS = 50
+"""Effective logged steps of half of the users that correct an estimate."""
+_BINS = 10
+"""Groups of simulated steps by expected reward, each compared with logged steps."""
 _WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE = 256
@@ -70,9 +73,8 @@ class Outcomes(NamedTuple):
     lengths: IntArray
     items: IntArray
     """(M,), all that were shown."""
-
-    def append(self, more: "Outcomes") -> "Outcomes":
-        return Outcomes._make(map(np.concatenate, zip(self, more, strict=True)))
+    expected: Float64Array
+    """(M,) expected rewards of these."""
 
 
 class _ManyRules(PolicyActor):
@@ -224,7 +226,8 @@ class RuleSearch:
         store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
         more = self._roll_out(near, store, n, self.problem.seed + _SEED_OF_REST)
         for rule, outcomes in more.items():
-            self._sessions[rule] = self._sessions[rule].append(outcomes)
+            parts = zip(self._sessions[rule], outcomes, strict=True)
+            self._sessions[rule] = Outcomes._make(map(np.concatenate, parts))
         best, results = self._summarise(top.rule), list[SimulatedRule]()
         for candidate in candidates:
             if candidate.rule in more:
@@ -252,16 +255,14 @@ class RuleSearch:
         store: EpisodeStore,
         n: int,
         seed: int,
-        users: UserModel | None = None,
     ) -> dict[DecisionRule, Outcomes]:
         """Simulate `n` sessions of each rule that begin as a store's, with draws of its own."""
-        scorers = [self.problem.scorer.under(rule) for rule in rules]
-        users = users or self.users
-        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules), self.list_size)
+        scorers, longest = [self.problem.scorer.under(rule) for rule in rules], self._longest
+        simulator = UserSimulator(self.users, store, n, longest, seed, len(rules), self.list_size)
         actor = _ManyRules(scorers, n, store, seed, self.list_size)
         live = np.arange(len(rules) * n)
         returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
-        decisions = list[IntArray]()
+        decisions = list[Float64Array]()
         with progress(len(live), "choose the rule", "sessions") as bar:
             while len(live):
                 actor.inform({schema.USER_IDS: simulator.users, schema.OFFER: simulator.offer})
@@ -270,15 +271,19 @@ class RuleSearch:
                 actor.observe(items, rewards)
                 returns[live] += rewards
                 lengths[live] += 1
-                decisions.append(np.stack([live, items], axis=1))
+                decisions.append(np.stack([live, items, simulator.expected]))
                 bar.update(len(live) - len(going))
                 if len(going) < len(live):
                     live = live[going]
                     actor.keep(going)
-        numbers, items = np.concatenate(decisions).T
-        shown = [items[numbers // n == number] for number in range(len(rules))]
-        parts = zip(returns.reshape(-1, n), lengths.reshape(-1, n), shown, strict=True)
-        return dict(zip(rules, map(Outcomes._make, parts), strict=True))
+        numbers, items, expected = np.concatenate(decisions, axis=1)
+        outcomes = {}
+        for number, rule in enumerate(rules):
+            sessions, steps = slice(number * n, number * n + n), numbers // n == number
+            integers = items[steps].astype(np.int64)
+            parts = returns[sessions], lengths[sessions], integers, expected[steps]
+            outcomes[rule] = Outcomes._make(parts)
+        return outcomes
 
     def _summarise(self, rule: DecisionRule) -> SimulatedRule:
         sessions = self._sessions[rule]
@@ -381,48 +386,71 @@ class RuleSearch:
         return agrees(half == 0), agrees(half == 1)
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
-        """The return of a session under a rule, in sessions that did not choose it: those of either
-        half of the users, with its own calibration; more where their standard error is large."""
+        """The return of a session under a rule, in sessions that did not choose it; those of either
+        half of the users are corrected by logged steps of that half."""
         halves = [self._roll_half(rule, number) for number in (0, 1)]
-        returns = halves[0].append(halves[1]).returns
-        if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
-            halves = [half.append(self._roll_half(rule, n, 1)) for n, half in enumerate(halves)]
-        values = float(halves[0].returns.mean()), float(halves[1].returns.mean())
-        value = sum(values) / 2
-        first, second = (_standard_error(half.returns) for half in halves)
-        error = max(math.hypot(first, second) / 2, abs(values[0] - values[1]) / 2)
-        report, training, doubts = self.users.calibration_report, self.users.training_users, []
-        optimism = None if report is None else (report.optimism, report.optimism_error)
+        sessions = draw_sessions(self.problem.train, self.problem.seed)
+        episodes, steps = sessions.all_steps()
+        propensities = read_propensities(sessions, episodes, steps)
+        weights = np.ones(len(steps)) if propensities is None else 1 / propensities
+        expected, users = self.users.expect_unseen(sessions), number_users(sessions)[episodes]
+        gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
+        corrections = []
+        for number, half in enumerate(halves):
+            rows = users % 2 == number
+            corrections.append(_correct(half, expected[rows], gains[rows], weights[rows]))
+        gains, gain_errors, counts = np.transpose(corrections)
+        values = gains + [half.returns.mean() for half in halves]
+        value, gain = values.mean(), gains.mean()
+        gain_error = math.hypot(*gain_errors) / 2
+        errors = [_standard_error(half.returns) for half in halves]
+        error = max(math.hypot(*errors, *gain_errors), np.ptp(values)) / 2
+        doubts = []
         if error > _FAR_OFF * abs(value):
             doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-        if report is not None and abs(report.optimism) > max(_FAR_OFF, report.optimism_error):
-            doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
-        weighted = training is not None and training[1].weighted
-        if not (weighted if report is None else report.weighted):
-            some = schema.PROPENSITY in self.problem.train.record.columns
-            lack = "some rows of the log have" if some else "the log has"
-            doubts.append(f"{lack} no propensities: its policy may have known more of the users")
+        if abs(gain) > max(2 * _FAR_OFF * abs(value - gain), 2 * gain_error):
+            doubts.append(f"the user model is off by {-gain:+.2g} at logged steps like its own")
+        if propensities is None:
+            doubts.append("the log has rows without propensities, whose policy may have known more")
+        elif counts.min() < _FEWEST_STEPS:
+            doubts.append(f"only {counts.min():.0f} effective logged steps are like its own")
+        if self.users.reward_report.new_users:
+            doubts.append("its users are new, and the log shows only some of what others like")
         length = max(float(half.lengths.mean()) for half in halves)
         if length > (longest := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")
-        return ValueEstimate(value, error, values, optimism, tuple(doubts))
+        first, second = values
+        return ValueEstimate(value, error, (first, second), (gain, gain_error), tuple(doubts))
 
-    def _roll_half(
-        self,
-        rule: DecisionRule,
-        number: int,
-        part: int = 0,
-    ) -> Outcomes:
-        """Sessions of one half of the users, with its own calibration; each part has others."""
+    def _roll_half(self, rule: DecisionRule, number: int) -> Outcomes:
+        """Sessions of one half of the users, with those last that begin as the search's do."""
         users, n = number_users(self._store), self._config.sessions
         episodes = np.flatnonzero(users % 2 == number)
         episodes = episodes if len(episodes) else np.arange(len(users))
-        store = self._store.select(np.roll(episodes, -(n // 2 + part * n)))
-        model, report = self.users, self.users.calibration_report
-        if report is not None:
-            model = replace(model, calibration=report.halves[number])
-        seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
-        return self._roll_out([rule], store, n, seed, model)[rule]
+        store = self._store.select(np.roll(episodes, -(n // 2)))
+        return self._roll_out([rule], store, _TIMES * n, self.problem.seed + 1 + number)[rule]
+
+
+def _correct(
+    simulated: Outcomes,
+    expected: Float64Array,
+    gains: Float64Array,
+    weights: Float64Array,
+) -> tuple[float, float, float]:
+    """How much more a simulated session would have if its steps had what logged steps (M,) of like
+    `expected` reward gain beyond it, the standard error, and the effective number of these."""
+    edges = np.quantile(simulated.expected, np.arange(_BINS) / _BINS)
+    rows = expected >= edges[0]
+    gains, weights, bins = gains[rows], weights[rows], np.searchsorted(edges[1:], expected[rows])
+    counts = np.bincount(np.searchsorted(edges[1:], simulated.expected), minlength=_BINS)
+    totals = np.bincount(bins, weights, _BINS)
+    if totals[counts > 0].min() == 0:
+        return 0.0, 0.0, 0.0
+    # Each logged step stands for simulated ones.
+    weights = weights * (counts / len(simulated.returns))[bins] / totals[bins]
+    gain = (weights * gains).sum()
+    error = float(np.linalg.norm(weights * (gains - gain / weights.sum())))
+    return gain, error, effective_number(weights)
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

@@ -105,13 +105,6 @@ class RuleEvidence:
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None
 
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """The 95% interval of `value`."""
-        if self.value is None or self.error is None:
-            return None
-        return self.value - 1.96 * self.error, self.value + 1.96 * self.error
-
 
 @dataclass(frozen=True)
 class SimulatedRule:
@@ -135,16 +128,17 @@ class SimulatedRule:
 
 @dataclass(frozen=True)
 class ValueEstimate:
-    """Return of a session under the chosen rule, in simulated sessions that did not choose it."""
+    """Return of a session under the chosen rule, in simulated sessions that did not choose it, plus
+    what logged steps that promise as much gave more than the user model expects of them."""
 
     value: float
     error: float
-    """Its standard error, over the sessions or between the halves, whichever is larger."""
+    """Its standard error, over sessions and steps or between the halves, whichever is larger."""
     halves: tuple[float, float]
-    optimism: tuple[float, float] | None
-    """`UserCalibration.optimism`, and its standard error; None where validation users are new."""
+    correction: tuple[float, float]
+    """What logged steps add to the simulated return, and its standard error."""
     doubts: tuple[str, ...]
-    """Why it cannot be trusted; empty if it can."""
+    """Why it is not printed; empty if it is."""
 
 
 @dataclass(frozen=True)

@@ -238,13 +238,13 @@ def describe_user_model(record: RunRecord) -> dict[str, object]:
     if (end := rule.session_end) is not None:
         rows |= {f"session end: loss, {kind}": loss for kind, loss in end.loss.items()}
         rows["session end: kept"] = end.kept
-    if (estimate := rule.estimate) is not None:
+    if rule.estimate is not None and rule.estimate.doubts:
+        rows["value is not estimated, as"] = "; ".join(rule.estimate.doubts)
+    elif (estimate := rule.estimate) is not None:
         rows["estimated value"] = f"{estimate.value:.4g} ± {estimate.error:.2g}"
         rows["in either half of the users"] = " and ".join(f"{v:.4g}" for v in estimate.halves)
-        if estimate.optimism is not None:
-            off, error = estimate.optimism
-            rows["rewards expected too high by"] = f"{off:+.1%} ± {error:.1%}"
-        rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
+        gain, error = estimate.correction
+        rows["of it added by logged steps"] = f"{gain:+.3g} ± {error:.2g}"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
     return rows

@@ -364,7 +364,7 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
 
 
 def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> list[str]:
-    """Lines on the user model, the rule, and how far its estimated return can be trusted."""
+    """Lines on the user model, the rule, and its estimated return, or why there is none."""
     indent = " " * 14
     lines = [
         f"user model    held-out loss {model.loss:.4f}, "
@@ -377,15 +377,19 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
             f"{indent}It ranked best of {choice.tried} rules in the validation period.",
             f"{indent}Selected by the {choice.chosen_by}{choice.warning}",
         ]
-    first, second = estimate.halves
     lines += [
         f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
         "simulated users, it has the best return",
-        f"{indent}(or one level with it) that the log supports: {estimate.value:.4g} ± "
-        f"{estimate.error:.2g} per session, estimated; logged sessions have {logged:.4g}.",
-        f"{indent}Halves of the users: {first:.4g} and {second:.4g}; "
-        f"{sum(choice.halves_agree or ())} of 2 choose this rule.",
-        *(f"{indent}WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts),
+        f"{indent}(or one level with it) that the log supports; "
+        f"{sum(choice.halves_agree or ())} of 2 halves of the users choose it.",
     ]
+    if estimate.doubts:
+        lines += [f"{indent}Its return is not estimated: {doubt}." for doubt in estimate.doubts]
+    else:
+        first, second = estimate.halves
+        lines.append(
+            f"{indent}Estimated return of a session: {estimate.value:.4g} ± {estimate.error:.2g}, "
+            f"of the halves {first:.4g} and {second:.4g}; logged sessions have {logged:.4g}."
+        )
     lines[-1] += choice.warning.replace("; WARNING", f"\n{indent}WARNING")
     return lines

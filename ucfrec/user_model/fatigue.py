@@ -69,11 +69,7 @@ class MainTags:
         items, rewards = (values[:, :run] for values in history)
         tags = self.tags[items.clamp(min=0)]
         alike = (tags == tags[:, :1]) & (items >= 0) & self.liked(rewards)
-        return torch.where(
-            alike.all(1) & (items.shape[1] >= run),
-            tags[:, 0],
-            -1,
-        )
+        return torch.where(alike.all(1) & (items.shape[1] >= run), tags[:, 0], -1)
 
 
 @dataclass(frozen=True)

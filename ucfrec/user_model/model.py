@@ -22,8 +22,9 @@ from ucfrec.user_model.reward_fit import (
     TrainingUsersReport,
     fit_item_reward_model,
     fit_training_users,
+    score_unseen,
 )
-from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
+from ucfrec.user_model.reward_report import ItemRewardReport, calibrate
 from ucfrec.user_model.running import RunningRates
 from ucfrec.user_model.session_end import (
     SESSIONS,
@@ -58,8 +59,6 @@ class UserModel:
     session_end_report: SessionEndReport
     fatigue: Fatigue | None
     main_tags: MainTags
-    calibration_report: UserCalibration | None = None
-    """How far the calibration can be trusted; None where validation users are new."""
 
     @classmethod
     def fit(
@@ -85,7 +84,7 @@ class UserModel:
             users[0].likeness = reward.likeness  # of the same items, in memory once
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
-            fatigue = calibration = None
+            fatigue = None
             if reward.binary:
                 first_runs, later_runs = (
                     LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS)
@@ -100,12 +99,9 @@ class UserModel:
             if users is not None and report.new_users:
                 line = users[1].calibration
             else:
-                model = users[0] if users else reward
-                calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
-                line = calibration.line
+                line = calibrate(users[0] if users else reward, validation, _MOST_STEPS, seed)
             fitted: dict[str, Any] = {
                 "calibration": line,
-                "calibration_report": calibration and asdict(calibration),
                 "session_end": asdict(end_report),
                 "fatigue": fatigue and asdict(fatigue),
             }
@@ -115,7 +111,7 @@ class UserModel:
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
-            of_calibration, of_fatigue = metadata["calibration_report"], metadata["fatigue"]
+            of_fatigue = metadata["fatigue"]
             return cls(
                 reward=reward,
                 reward_report=report,
@@ -125,7 +121,6 @@ class UserModel:
                 session_end_report=SessionEndReport(**metadata["session_end"]),
                 fatigue=of_fatigue and Fatigue(**of_fatigue),
                 main_tags=tags,
-                calibration_report=of_calibration and UserCalibration(**of_calibration),
             )
 
     @property
@@ -142,8 +137,18 @@ class UserModel:
         offer: Offer | None = None,
     ) -> Float64Array:
         """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
-        slope, intercept = self.calibration
         scores = self.rewarding.score(states, history, users, items, offer)
+        return self._expect_of(scores, history)
+
+    def expect_unseen(self, sessions: EpisodeStore) -> Float64Array:
+        """Expected rewards (M,) of all steps of training sessions, by fits to other steps."""
+        report = self.training_users[1] if self.training_users else self.reward_report
+        weighted = self.reward_report.new_users
+        rows, scores = score_unseen(self.rewarding, report.effects, weighted, sessions)
+        return self._expect_of(scores, rows.history)
+
+    def _expect_of(self, scores: Tensor, history: Shown) -> Float64Array:
+        slope, intercept = self.calibration
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
         if self.fatigue is None:
             return rewards
@@ -236,7 +241,8 @@ class UserSimulator:
         return self._store.offer(self._episodes, steps)
 
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
-        """Show one item (M,) in every session: rewards (M,), and positions of those that go on."""
+        """Show one item (M,) in every session: rewards (M,), and positions of those that go on;
+        `expected` then has the expected rewards (M,)."""
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         history, users = self._sessions.shown.latest(self._lags), self._sessions.users
         if not self._place:
@@ -246,8 +252,8 @@ class UserSimulator:
             self._before = states, history
         self._place = (self._place + 1) % self._length
         steps = self._sessions.steps.numpy()
-        expected = self._model.expect(*self._before, users, items, self.offer)
-        rewards = self._logged.draw(expected, self._draw_uniform())
+        self.expected = self._model.expect(*self._before, users, items, self.offer)
+        rewards = self._logged.draw(self.expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
         self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))
         ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)

@@ -70,15 +70,7 @@ class UserPosterior(nn.Module):
             targets: (B, N) what they earned, as `ItemRewardModel.target`.
         """
         valid, items = items >= 0, items.clamp(min=0)
-        inputs = (
-            F.pad(
-                vectors[items],
-                (1, 0),
-                value=1.0,
-            )
-            @ self.root
-            * valid.unsqueeze(2)
-        )
+        inputs = F.pad(vectors[items], (1, 0), value=1.0) @ self.root * valid.unsqueeze(2)
         unusual = (targets - self.usual[items]) * valid
         matrix = inputs.mT @ inputs + torch.eye(len(self.root), device=inputs.device)
         solution = _solution(matrix, inputs.mT @ unusual.unsqueeze(2)).squeeze(2)

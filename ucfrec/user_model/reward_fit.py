@@ -6,7 +6,7 @@ log has all propensities, rows of new users are weighted, as policies that knew 
 shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 import pydantic
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
@@ -29,6 +30,7 @@ from ucfrec.user_model.reward_effects import (
     Beginning,
     Design,
     EffectSearch,
+    fit_effects,
 )
 from ucfrec.user_model.reward_report import (
     SAVED,
@@ -50,6 +52,8 @@ _MAX_STEPS = 100_000
 _WARM_ROWS = 25_000
 """Most rows of a search that begins near an earlier one."""
 _CONSTANT = 1e-6
+_FOLDS = 5
+"""Parts of the rows, each predicted by a fit to the others."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -60,8 +64,6 @@ class TrainingUsersReport:
     """Slope and intercept of the model's scores on training rows that were held back."""
     effects: tuple[EffectTried, ...]
     """The effects that were tried, evaluated on these rows."""
-    weighted: bool
-    """Whether the effects are fitted to rows weighted by propensities."""
 
 
 def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -201,9 +203,30 @@ def fit_training_users(
     scores = held_out.predictor(search.effects)
     line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
     search.fit_to(design)
-    report = TrainingUsersReport(line, search.report(), weights is not None)
+    report = TrainingUsersReport(line, search.report())
     search.save(file, model, report)
     return model, report
+
+
+def score_unseen(
+    model: ItemRewardModel,
+    tried: Sequence[EffectTried],
+    weighted: bool,
+    sessions: EpisodeStore,
+) -> tuple[RewardRows, Tensor]:
+    """All steps of training sessions and their scores (M,), each by effects that are as strong as
+    those of the model, but fitted to the other folds; to rows `weighted` by propensities or not."""
+    episodes, steps = sessions.all_steps()
+    rows = RewardRows.at(sessions, episodes, steps, model.lags)
+    weights = weigh_by_propensity(sessions, episodes, steps, len(model.item)) if weighted else None
+    design, folds = Design.of(model, rows, weights), torch.arange(len(rows)) % _FOLDS
+    spreads = {effect.effect: effect.spread for effect in tried if effect.kept}
+    scores = torch.zeros(len(rows))
+    for fold in range(_FOLDS):
+        fitted = design.select(folds != fold)
+        effects = fit_effects(fitted, fitted.mean_effect(), spreads)
+        scores[folds == fold] = design.select(folds == fold).predictor(effects)
+    return rows, scores
 
 
 def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:

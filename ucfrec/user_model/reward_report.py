@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
@@ -22,8 +22,6 @@ _CHUNK = 16_384
 _READ_AT_ONCE = 16_384
 _LARGEST_WEIGHT = 10.0
 """Larger weights are cut off, so that no single row decides."""
-_FEWEST = 50
-"""Rows of a half from which on a line is fitted to it."""
 SAVED = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
 Line = tuple[float, float]
@@ -229,48 +227,16 @@ def fit_line(
     return float(model.coef_[0]), float(model.intercept_)
 
 
-@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
-class UserCalibration:
-    """Slope and intercept that turn scores into rewards, from validation rows."""
-
-    line: Line
-    halves: tuple[Line, Line]
-    """Of the rows of either half of the users; `line` where they are too few."""
-    optimism: float
-    """Expected over observed reward, less 1, where each half is predicted by the other's line."""
-    optimism_error: float
-    """Its standard error over users."""
-    weighted: bool
-
-    @classmethod
-    def fit(
-        cls,
-        model: ItemRewardModel,
-        view: EpisodeStore,
-        limit: int,
-        seed: int,
-    ) -> "UserCalibration":
-        """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
-        episodes, steps = draw_steps(view, limit, seed)
-        rows = RewardRows.at(view, episodes, steps, model.reach)
-        half = number_users(view)[episodes] % 2
-        weights = weigh_by_propensity(view, episodes, steps, len(model.item))
-        counts = torch.ones(len(rows)) if weights is None else weights
-        scores, target = score_rows(model, rows), model.target(rows.rewards)
-
-        def fit_part(chosen: BoolArray) -> Line:
-            part = torch.from_numpy(chosen)
-            return fit_line(scores[part], target[part], bool(model.binary), counts[part])
-
-        line = fit_part(np.ones(len(rows), dtype=bool))
-        lines = [fit_part(half == n) if (half == n).sum() >= _FEWEST else line for n in (0, 1)]
-        slope, intercept = torch.tensor(lines[::-1])[torch.from_numpy(half)].unbind(1)
-        expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
-        observed = (counts * rows.rewards).double().numpy()
-        ratio, error = 1.0, 0.0
-        if observed.sum() > 0:
-            ratio = expected.sum() / observed.sum()
-            # By linearisation, over sessions.
-            residual = np.bincount(episodes, expected - ratio * observed)
-            error = float(np.linalg.norm(residual) / observed.sum())
-        return cls(line, (lines[0], lines[1]), ratio - 1, error, weights is not None)
+def calibrate(
+    model: ItemRewardModel,
+    view: EpisodeStore,
+    limit: int,
+    seed: int,
+) -> Line:
+    """Slope and intercept that turn scores into rewards, from at most `limit` drawn steps of a
+    view, weighted by propensities if all steps have one."""
+    episodes, steps = draw_steps(view, limit, seed)
+    rows = RewardRows.at(view, episodes, steps, model.reach)
+    weights = weigh_by_propensity(view, episodes, steps, len(model.item))
+    target = model.target(rows.rewards)
+    return fit_line(score_rows(model, rows), target, bool(model.binary), weights)

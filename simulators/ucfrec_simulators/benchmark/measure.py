@@ -66,7 +66,7 @@ def _training_metrics(record: RunRecord) -> dict[str, Any]:
         "train_wall_time_s": record.wall_time_s,
         "validation_loss": record.finished.best_validation,
     }
-    if record.rule is not None and (of := record.rule.estimate) is not None:
+    if record.rule and (of := record.rule.estimate) and not of.doubts:
         metrics |= {"estimated_value": of.value, "estimated_value_error": of.error}
     if (augmentation := record.augmentation) is None:
         return metrics

@@ -60,8 +60,9 @@ def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> 
     records = [read_json(path) for path in out.rglob(RUN)]
     own = [record["rule"]["estimate"] for record in records if "rule" in record]
     names = ("estimated_value", "estimated_value_error")
-    assert sorted(tuple(row.metrics[name] for name in names) for row in of_dt) == sorted(
-        (each["value"], each["error"]) for each in own
+    printed = [row for row in of_dt if names[0] in row.metrics]
+    assert sorted(tuple(row.metrics[name] for name in names) for row in printed) == sorted(
+        (each["value"], each["error"]) for each in own if not each["doubts"]
     )
 
 

@@ -161,7 +161,7 @@ def test_vectors_are_kept_until_a_weight_changes() -> None:
 
     def check() -> Tensor:
         vectors = head.vectors(torch.arange(N))
-        expected = features @ vectors.T / DIM**0.5 + head.acting_bias
+        expected = features @ vectors.T / DIM**0.5 + head.bias + head.recency
         with torch.no_grad():
             assert head.all_vectors() is head.all_vectors()
             found = head.predict(features)

@@ -1,5 +1,6 @@
 """Running rates are of earlier rows only, and tell what new items are worth."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,16 @@ from tests.support.logs import START, store_of, write
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.user_model.running import AGES, HALF_LIVES, RunningRates
+from ucfrec.user_model.running import (
+    AGES,
+    HALF_LIVES,
+    HALF_LIVES_OF_DEMAND,
+    Demand,
+    RunningRates,
+)
 
 HOUR, DAY, ITEMS = 3_600_000, 86_400_000, 60
+ALL_ALIKE = torch.tensor(HALF_LIVES_OF_DEMAND).isinf().float()
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +86,47 @@ def test_new_items_are_judged_by_what_they_earned_so_far(
     newest = store.item_states.embeddings.shape[0] - 3
     assert torch.equal(split.reward_model.latest[:, newest:], torch.zeros(len(HALF_LIVES), 3))
     assert sums[0].shape == sums[1].shape == (1, ITEMS)
+
+
+def drifting_store(folder: Path, drift: bool) -> EpisodeStore:
+    """Items in demand for a day each, or the same ones all the time."""
+    rng, days = np.random.default_rng(0), np.repeat(np.arange(40), 100)
+    items = rng.integers(30, size=len(days)) + (days if drift else 20)
+    log = pd.DataFrame({"user_id": rng.integers(200, size=len(days)), "item_id": items})
+    times = START + days * DAY + rng.integers(DAY, size=len(days))
+    log = log.assign(timestamp=np.sort(times), reward=rng.integers(2, size=len(days)) * 1.0)
+    return store_of(log, folder, LogMapping(session_by="user"))
+
+
+def test_demand_is_that_of_earlier_steps_and_follows_drift(tmp_path: Path) -> None:
+    store = drifting_store(tmp_path, drift=True)
+    train, validation = store.split("train"), store.split("validation")
+    demand = Demand.of(train, validation, ALL_ALIKE)
+    assert demand is not None
+    assert demand.mixture[:3].sum() > 0.5
+    torch.testing.assert_close(demand.logs.exp().sum(1), torch.ones(len(demand.logs)))
+    # At the begin of each bin, an independent count of the steps before it.
+    items, times = (train.column(name) for name in ("item", "timestamp"))
+    bins = (times - demand.bins.begin) // demand.bins.width
+    n_items = demand.logs.shape[1]
+    for place in (0, 7, len(demand.logs) - 1):
+        expected = np.zeros(n_items)
+        for weight, hours in zip(demand.mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True):
+            before = bins < place
+            age = (place - 1 - bins[before]) * demand.bins.width / HOUR
+            sums = 1.0 * np.bincount(items[before], 0.5 ** (age / hours), n_items)
+            sums += 1.0 if math.isinf(hours) else 1 / n_items
+            expected += weight * sums / sums.sum()
+        np.testing.assert_allclose(demand.logs[place].exp().numpy(), expected, rtol=1e-4)
+    # Held-out steps are likelier than under shares of all steps.
+    later = torch.from_numpy(validation.column("item")).long()
+    later = later[torch.from_numpy(train.item_counts() > 0)[later]]
+    constant = torch.from_numpy(train.item_counts() + 1.0)
+    gain = demand.logs[-1][later] - torch.log(constant / constant.sum())[later]
+    assert gain.mean() > 0.5
+
+
+def test_steady_demand_changes_nothing(tmp_path: Path) -> None:
+    store = drifting_store(tmp_path, drift=False)
+    train, validation = store.split("train"), store.split("validation")
+    assert Demand.of(train, validation, ALL_ALIKE) is None

@@ -445,7 +445,7 @@ class _ItemProduct:
             if not self.own:
                 assert self._head is not None
                 blocks = [(self._head.project(self._head.embeddings) + self._head.correction).cpu()]
-                bias = self._head.acting_bias.detach().cpu()
+                bias = (self._head.bias + self._head.recency).detach().cpu()
             of_policy = sum(block.shape[1] for block in blocks)
             if self._by_direction:
                 assert self._likeness is not None

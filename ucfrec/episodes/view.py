@@ -18,7 +18,7 @@ from ucfrec.episodes.offers import Offer, Offers
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Transitions, Windows, draw_ends, list_earlier
+from ucfrec.episodes.windows import Steps, Transitions, Windows, draw_ends, list_earlier
 from ucfrec.errors import InputError
 
 _DTYPES = {
@@ -403,11 +403,9 @@ class EpisodeView:
             counts += np.bincount(items, minlength=len(counts))
         return counts
 
-    def draw_steps(
-        self, generator: np.random.Generator, count: int, length: int = 1
-    ) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (count,): steps drawn uniformly, with replacement; or the ends of
-        windows of this `length`, such that every step is in as many windows as any other."""
+    def draw_steps(self, generator: np.random.Generator, count: int, length: int = 1) -> Steps:
+        """Steps drawn uniformly, with replacement; or ends of windows of this `length`, such that
+        every step is in as many windows as any other."""
         return draw_ends(generator, count, self._ends, self.lengths, length)
 
     def locate(self, numbers: IntArray) -> tuple[IntArray, IntArray]:

@@ -20,6 +20,8 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
 
+Steps = tuple[IntArray, IntArray]
+"""Episodes (M,) and steps (M,) of them."""
 AUGMENTED = "augmented.safetensors"
 """Name of the file of a run."""
 
@@ -48,7 +50,8 @@ class _Rows:
 
 @dataclass(frozen=True)
 class Windows(_Rows):
-    """B windows of K steps, padded on the left; at padding all values are 0 and `mask` is false."""
+    """B windows of K steps, padded on the left; at padding `mask` is false, and all values but
+    times and offers are 0."""
 
     states: Tensor
     """(B, K, S) float32."""
@@ -227,7 +230,7 @@ class Exposed(_Rows):
 
 def draw_ends(
     generator: np.random.Generator, count: int, ends: IntArray, lengths: IntArray, length: int
-) -> tuple[IntArray, IntArray]:
+) -> Steps:
     """See `EpisodeView.draw_steps`; `ends` (E,) are running totals of steps that are drawn, which
     are the last of `lengths` (E,)."""
     # Windows that would end up to `length` − 1 steps after a session end with it.
@@ -510,9 +513,7 @@ class TrainingEpisodes:
         # A sentinel, so that every search ends inside.
         self._keys = np.append(keys, np.iinfo(np.int64).max)
 
-    def draw_steps(
-        self, generator: np.random.Generator, count: int, length: int = 1
-    ) -> tuple[IntArray, IntArray]:
+    def draw_steps(self, generator: np.random.Generator, count: int, length: int = 1) -> Steps:
         """As `EpisodeStore.draw_steps`."""
         return draw_ends(generator, count, self._ends, self._lengths, length)
 

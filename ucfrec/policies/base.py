@@ -90,10 +90,9 @@ class SequencePolicy(nn.Module, ABC):
     items_only: ClassVar[str] = ""
     """Name of a policy that recommends items and refuses vectors; empty for others."""
     counts_steps_alike: ClassVar[bool] = False
-    """Whether windows are drawn so that every step is in as many as any other; otherwise their last
-    steps are drawn uniformly, and the last steps of a session are in fewer."""
-    refit_share: ClassVar[float] = 0.25
-    """Steps of a refit, as a share of those that the best weights took."""
+    """Whether windows are drawn so that every step is in as many; otherwise their ends are."""
+    refits_fully: ClassVar[bool] = False
+    """Whether a refit takes as many steps as the training did, not a share of the best weights'."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 

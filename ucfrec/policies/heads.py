@@ -131,43 +131,31 @@ class ItemHead(nn.Module):
         self.embeddings = embeddings.to(self.embeddings)
         self.counts.copy_(counts + 1)
         self._proposal = None
-        with torch.no_grad():
-            self.prior.copy_(
-                torch.log(self.counts / (self.counts.sum() if even is None else even + 1))
-            )
-            self.bias.copy_(self.prior)
+        totals = self.counts.sum() if even is None else even + 1
+        self.prior.copy_(torch.log(self.counts / totals))
+        self.bias.data.copy_(self.prior)
 
-    @torch.no_grad()
-    def move_bias(self, prior: Tensor) -> None:
-        """Let the bias have begun as `prior` (n_items,); what was learned since stays."""
-        self.bias.add_(prior - self.prior)
-        self.prior.copy_(prior)
-
-    def follow(self, demand: Demand) -> None:
-        """Add to the bias by how much the shares of the items at the time of a training step, and
-        in evaluation mode the latest, exceed what the bias began with: what the network learns is
-        what the demand of the day does not say."""
+    def follow(self, demand: Demand, prior: Tensor | None = None) -> None:
+        """Add to the bias by how much the items' shares at the time of a training step, and in
+        evaluation mode the latest, exceed what the bias began with, so that the network learns what
+        demand does not say. A bias that other steps taught is moved to the `prior` of these."""
+        if prior is not None:
+            self.bias.data.add_(prior - self.prior)
+            self.prior.copy_(prior)
         self.mixture.copy_(demand.mixture)
         self.recency.copy_(demand.logs[-1] - self.prior)
         self._demand = replace(demand, logs=demand.logs.to(self.prior))
 
-    @property
-    def acting_bias(self) -> Tensor:
-        """(n_items,) what is added to the products."""
-        return self.bias + self.recency
-
-    def _sum_bias(
-        self, exposed: Exposed | None, items: Tensor | None = None, of_rows: bool = False
-    ) -> Tensor:
+    def _sum_bias(self, exposed: Exposed | None, items: Tensor | None, apart: bool) -> Tensor:
         """The bias of `items` (L,), None for all, (L,) or at the times of M training steps (M, L);
-        with `of_rows`, of one item (M,) of each step, (M,)."""
+        with `apart`, of one item (M,) of each step, (M,)."""
+        places = slice(None) if items is None else items
         bias = self.bias if items is None else torch.gather(self.bias, 0, items, sparse_grad=True)
         if not self.training or self._demand is None or exposed is None or exposed.times is None:
-            return bias + (self.recency if items is None else self.recency[items])
+            return bias + self.recency[places]
         rows = self._demand.bins.rows(exposed.times)
-        rows = rows if of_rows or items is None else rows.unsqueeze(1)
-        logs = self._demand.logs[rows] if items is None else self._demand.logs[rows, items]
-        return bias + logs - (self.prior if items is None else self.prior[items])
+        rows = rows if apart or items is None else rows.unsqueeze(1)
+        return bias + self._demand.logs[rows, places] - self.prior[places]
 
     def vectors(self, items: Tensor) -> Tensor:
         """Vectors (..., d) of int64 items (...,)."""
@@ -215,7 +203,7 @@ class ItemHead(nn.Module):
         shown before the M steps, which an exposure term needs; or those (M, L) over `items` (L,),
         ascending, each once, plus an `offset` (L,)."""
         vectors = self.all_vectors() if items is None else self.embed(items)
-        bias = self._sum_bias(exposed, items) + offset
+        bias = self._sum_bias(exposed, items, apart=False) + offset
         # Scaling the features instead of the logits saves two passes over the larger of them.
         features = features / features.shape[-1] ** 0.5
         logits = F.linear(features, vectors, bias if bias.dim() == 1 else None).float()
@@ -292,7 +280,7 @@ class ItemHead(nn.Module):
     ) -> Tensor:
         """Logits (M,) of the logged items."""
         product = (features * self.embed(actions)).sum(-1) / features.shape[-1] ** 0.5
-        logit: Tensor = product + self._sum_bias(exposed, actions, of_rows=True)
+        logit: Tensor = product + self._sum_bias(exposed, actions, apart=True)
         if self.exposure is not None and exposed is not None:
             return logit + self.exposure.to_items(exposed, actions.unsqueeze(1))
         return logit

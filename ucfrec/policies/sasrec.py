@@ -27,16 +27,14 @@ class SASRecConfig(DTConfig):
 
 
 class SASRecPolicy(SequencePolicy):
-    """Causal self-attention over a_0, …, a_{t−1}; states, rewards and returns are not used. The
-    loss is the action head's softmax; the paper's contrasts the item with a single random item.
-
-    Positions are counted from the end of a window, so that the last one is that of the newest item.
-    """
+    """Causal self-attention over a_0, …, a_{t−1}, whose positions count from the newest; states,
+    rewards and returns are not used. The loss is the action head's softmax; the paper's contrasts
+    the item with a single random item."""
 
     Config = SASRecConfig
     config: SASRecConfig
     counts_steps_alike = True
-    refit_share = 2.0
+    refits_fully = True
     presets: ClassVar[Mapping[str, Any]] = {
         "train.learning_rate": 1e-3,
         "train.steps": 3000,

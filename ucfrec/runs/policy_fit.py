@@ -52,24 +52,22 @@ def fit_policy(
     """
     k, device, folder = policy.config.context, policy.state_mean.device, out / "policy"
     solve = policy.make_solver(train, validation, folder, config.seed)
-    head = policy.head
+    head, prior = policy.head, None
     if start is not None:
-        weights, began = load_tensors(start)[0], getattr(head, "prior", torch.empty(0)).clone()
+        prior = head.prior.clone() if isinstance(head, ItemHead) else None
+        weights = load_tensors(start)[0]
         names = policy.state_dict().keys() if solve is None else policy.chosen
         policy.load_state_dict({name: weights[name] for name in names}, strict=solve is None)
-        if isinstance(head, ItemHead) and solve is None:
-            head.move_bias(began)
     alone = solve is not None or distributed.processes() == 1
-    windows, shown = [], None
-    if train.has_items and not train.has_offers:
-        shown = train.item_counts() > 0
+    windows = []
+    learnable = train.item_counts() > 0 if train.has_items and not train.has_offers else None
     if validation is not None:
         generator = np.random.default_rng([config.seed, 0])
         for number in range(_VALIDATION_BATCHES):
             episodes, steps = validation.draw_steps(generator, _VALIDATION_BATCH)
-            if shown is not None:  # an item without training steps cannot be learned
+            if learnable is not None:  # an item without training steps cannot be learned
                 items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-                episodes, steps = episodes[shown[items]], steps[shown[items]]
+                episodes, steps = episodes[learnable[items]], steps[learnable[items]]
             if alone or number % distributed.processes() == distributed.rank():
                 windows.append(validation.windows(episodes, steps, k))
 
@@ -86,14 +84,17 @@ def fit_policy(
             return _fit_once(policy, solve, folder, validate, config.policy_name, callbacks)
     timed = schema.TIMESTAMP in train.record.columns and not train.has_offers
     if isinstance(head, ItemHead) and timed:
-        head.follow(Demand.of(train, validation, head.mixture))
+        demand = Demand.of(train, validation, head.mixture)
+        if demand is not None:
+            head.follow(demand, prior)
     size, rows = config.train.batch_size, distributed.share(config.train.batch_size)
     newest = np.array([], dtype=np.int64) if newest is None else newest
     recent = train.select(newest)
     training = train if augmented is None else TrainingEpisodes(train, augmented)
 
+    reach = k if policy.counts_steps_alike else 1
+
     def draw(generator: np.random.Generator) -> Windows:
-        reach = k if policy.counts_steps_alike else 1
         episodes, steps = training.draw_steps(generator, size, reach)
         if len(newest):
             of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]), reach)

@@ -16,15 +16,19 @@ from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 from ucfrec.user_model.session_end import SESSIONS
 
+SHARE = 0.25
+"""Steps of a refit, as a share of those that the best weights took."""
+
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     """Go on training the policy of the finished run `first`, on all episodes of its store.
 
     Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
     model's effects and the decision rule are those of `first`. The best weights are trained for
-    the policy's `refit_share` of the steps that they took, while the learning rate falls to 0;
-    policies that are fitted without gradients are fitted again. Item embeddings stay those of the
-    store's training split. There is nothing left to evaluate the policy on but later logs.
+    `SHARE` of the steps that they took, or as many as the training had if the policy
+    `refits_fully`, while the learning rate falls to 0; policies that are fitted without gradients
+    are fitted again. Item embeddings stay those of the store's training split. There is nothing
+    left to evaluate the policy on but later logs.
 
     Args:
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
@@ -49,8 +53,9 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     if chosen.dropped_observations:
         store = store.without_observation_dimensions(chosen.dropped_observations)
     config = chosen.config
-    share = policy_class(config.policy_name).refit_share
-    steps = max(1, round(share * chosen.finished.best_step))
+    steps = max(1, round(SHARE * chosen.finished.best_step))
+    if policy_class(config.policy_name).refits_fully:
+        steps = chosen.finished.steps
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))

@@ -285,11 +285,10 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
     returns, and the lookahead the same number of mean rewards."""
     old = TrainedPolicy.load(initial, split=True)
     rule, quantiles = old.rule, np.array(new.record.config.rule.quantiles)
-    if rule.target is not None:
-        distances = [abs(old.target_return(quantile) - rule.target) for quantile in quantiles]
-        moved = new.target_return(float(quantiles[np.argmin(distances)]))
-        least = None if rule.minimum_target is None else moved
-        rule = replace(rule, target=moved, minimum_target=least)
+    distances = [abs(old.target_return(quantile) - rule.target) for quantile in quantiles]
+    moved = new.target_return(float(quantiles[np.argmin(distances)]))
+    least = None if rule.minimum_target is None else moved
+    rule = replace(rule, target=moved, minimum_target=least)
     reward, old_reward = (
         record.mean_return * record.train_episodes / record.train_steps
         for record in (new.record, old.record)

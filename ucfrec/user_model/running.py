@@ -7,6 +7,7 @@ rows would be unknown for items that are new, and known too well for those befor
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +23,6 @@ _HOUR_MS = 3_600_000
 HALF_LIVES = (6.0, 24.0, 96.0, math.inf)
 """Hours after which a row counts half, one rate each."""
 HALF_LIVES_OF_DEMAND = (6.0, 24.0, 96.0, 384.0, 1536.0, 6144.0, math.inf)
-"""Hours, as `HALF_LIVES`."""
 AGES = 2
 """Inputs of an item's age: in days, and the logarithm of its hours and 1."""
 _PRIOR = 20.0
@@ -30,40 +30,41 @@ _PRIOR = 20.0
 _ENTRIES = 2**24
 """Most rates that are kept."""
 _ROUNDS = 100
+_NO_DRIFT = 100.0
+_STEADY = 0.9
+"""Held-out steps that are added to those for "all steps count alike", whose weight from `_STEADY`
+on means that they do."""
 _OLDEST = 30.0
 """Days from which on an item is as old as any."""
 
 
-@dataclass(frozen=True)
-class TimeBins:
-    """T bins of time."""
+class TimeBins(NamedTuple):
+    """T = `number` bins of time, the first from `begin` on, of `width` ms each."""
 
     begin: int
-    """Of the first bin, ms."""
     width: int
-    """Of a bin, ms."""
-    count: int
-    """T."""
+    number: int
 
     @classmethod
     def of(cls, view: EpisodeStore, numbers: int) -> "TimeBins":
         """Bins of an hour or more, of the steps of a view, for so many `numbers` each."""
         times = view.column(schema.TIMESTAMP)
         begin, span = int(times.min()), int(times.max() - times.min()) + 1
-        count = min(max(1, _ENTRIES // numbers - 1), -(-span // _HOUR_MS))
-        return cls(begin, -(-span // count), count)
+        number = min(max(1, _ENTRIES // numbers - 1), -(-span // _HOUR_MS))
+        return cls(begin, -(-span // number), number)
 
     def rows(self, times: Tensor) -> Tensor:
         """Numbers (...) of what was known at times (...), ms: 0 to T."""
-        return ((times - self.begin) // self.width).clamp(0, self.count)
+        return ((times - self.begin) // self.width).clamp(0, self.number)
 
     def sum(self, view: EpisodeStore, weights: Float64Array | None = None) -> Float64Array:
         """(T, n_items) sums by bin and item of the weights (N,) of the steps; None counts them."""
-        n_items, shape = len(view.item_states.embeddings), (self.count, -1)
+        n_items = len(view.item_states.embeddings)
         bins = (view.column(schema.TIMESTAMP) - self.begin) // self.width
-        places = bins * n_items + view.column(schema.ITEM)
-        sums = np.bincount(places, weights, self.count * n_items)
-        return sums.astype(np.float64).reshape(shape)
+        sums = np.bincount(
+            bins * n_items + view.column(schema.ITEM), weights, self.number * n_items
+        )
+        return sums.astype(np.float64).reshape(self.number, n_items)
 
     def decay(self, sums: Float64Array, hours: float) -> Float64Array:
         """Of sums (T, n) by bin, those (T + 1, n) until the begin of each bin, and after the last,
@@ -88,21 +89,18 @@ class RunningRates:
 
     @classmethod
     def of(cls, store: EpisodeStore, target: Callable[[Tensor], Tensor]) -> "RunningRates | None":
-        """The rates of all rows of a store, whose rewards (N,) `target` turns into what is
-        predicted, from 0 to 1 or standardised; None if its items are always available.
-
-        Rates at a time are of rows in earlier bins: never of the decision's own.
-        """
+        """The rates of all rows of a store, those at a time of rows in earlier bins, whose rewards
+        (N,) `target` turns into what is predicted, from 0 to 1 or standardised; None if its items
+        are always available."""
         if not store.has_offers:
             return None
         view = store.whole
         bins = TimeBins.of(view, len(HALF_LIVES) * len(view.item_states.embeddings))
         earned = target(torch.from_numpy(view.column(schema.REWARD))).double().numpy()
         counts, sums = bins.sum(view), bins.sum(view, earned - earned.mean())
-        rates = [
-            bins.decay(sums, hours) / (bins.decay(counts, hours) + _PRIOR) for hours in HALF_LIVES
-        ]
-        return cls(bins, torch.from_numpy(np.stack(rates, axis=1)).float())
+        decayed = [(bins.decay(sums, hours), bins.decay(counts, hours)) for hours in HALF_LIVES]
+        rates = np.stack([total / (count + _PRIOR) for total, count in decayed], axis=1)
+        return cls(bins, torch.from_numpy(rates).float())
 
     def inputs(self, offer: Offer, items: Tensor) -> Tensor:
         """(M, H + `AGES`) rates and ages of one item (M,) each, at the times of the decisions."""
@@ -119,21 +117,18 @@ class RunningRates:
 
 @dataclass(frozen=True)
 class Demand:
-    """How often items are shown: a mixture of their shares of the steps until a time, in which
-    older steps count less."""
+    """How often items are shown of late: a mixture of shares in which older steps count less."""
 
     bins: TimeBins
     mixture: Tensor
     """(H,) float32 weights of the `HALF_LIVES_OF_DEMAND`."""
     logs: Tensor
-    """(T + 1, n_items) float32 logarithms of the shares at the begin of each bin, and after the
-    last."""
+    """(T + 1, n_items) float32 logs of the shares at the begin of each bin, and after the last."""
 
-    @classmethod
-    def of(cls, train: EpisodeStore, validation: EpisodeStore | None, mixture: Tensor) -> "Demand":
-        """The demand for the items of training steps, with the mixture under which the items of
-        validation steps are likeliest; without them, or if no training step shows these, with the
-        given one."""
+    @staticmethod
+    def of(train: EpisodeStore, held_out: EpisodeStore | None, mixture: Tensor) -> "Demand | None":
+        """The demand for items of training steps, with the mixture under which those of held-out
+        steps are likeliest; without these, with the given one. None if all steps count alike."""
         bins = TimeBins.of(train, len(train.item_states.embeddings))
         counts, later = bins.sum(train), np.zeros(0)
 
@@ -143,20 +138,25 @@ class Demand:
             totals /= totals.sum(1, keepdims=True)
             return totals
 
-        if validation is not None:
-            later = np.where(counts.any(0), validation.item_counts(), 0.0)
+        if held_out is not None:
+            later = np.where(counts.any(0), held_out.item_counts(), 0.0)
         if later.any():
             last = np.stack([shares(hours)[-1] for hours in HALF_LIVES_OF_DEMAND])
             weights = np.full((len(last), 1), 1 / len(last))
             for _ in range(_ROUNDS):  # of expectation maximisation
                 parts = weights * last
-                weights = (parts / parts.sum(0) * later / later.sum()).sum(1, keepdims=True)
-            mixture = torch.from_numpy(weights[:, 0]).float()
+                steps = (parts / parts.sum(0) * later).sum(1, keepdims=True)
+                steps[-1] += _NO_DRIFT
+                weights = steps / steps.sum()
+            if weights[-1, 0] < _STEADY:
+                mixture = torch.from_numpy(weights[:, 0]).float()
+        if mixture[-1] == 1:
+            return None
         mixed = np.zeros((len(counts) + 1, counts.shape[1]))
         for weight, hours in zip(mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True):
             if weight:
                 mixed += weight * shares(hours)
-        return cls(bins, mixture, torch.from_numpy(np.log(mixed)).float())
+        return Demand(bins, mixture, torch.from_numpy(np.log(mixed)).float())
 
 
 def _ages(times: Tensor, begin: Tensor) -> Tensor:

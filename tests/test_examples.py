@@ -11,9 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from examples.make_news_log import make_log as make_news
+from examples.make_ratings_log import RATINGS
+from examples.make_ratings_log import make_log as make_ratings
 from examples.make_shop_log import make_log
 from examples.simulated_month import Day, Month, plot, simulate, summary
 from tests.support.markdown import ROOT
+from ucfrec import EpisodeStore, Recommender, prepare
 from ucfrec.logs.mapping import read_mapping
 from ucfrec.logs.prepare import PrepareOptions, validate
 
@@ -128,3 +132,24 @@ def test_a_policy_that_is_updated_earns_more_than_one_that_is_not(tmp_path: Path
     )
     assert reward > 1.15 * frozen
     assert np.mean([found for day in days for found in day.covered if found is not None]) > 0.7
+
+
+def test_the_publisher_trains_where_sessions_see_all_there_is(tmp_path: Path) -> None:
+    make_news(tmp_path, sessions=300)
+    mapping = read_mapping(tmp_path / "news.toml")
+    prepare([tmp_path / "impressions.parquet"], mapping, tmp_path / "store")
+    settings = [*SETTINGS, "train.steps=10", "policy.dim=8"]
+    recommender = Recommender("dt", settings=settings)
+    recommender.fit(EpisodeStore.open(tmp_path / "store"), tmp_path / "run", refit=False)
+    times = "2026-10-18T20:00", "2026-10-18T08:00"
+    evening, morning = (recommender.recommend(k=4, at=time).request_id for time in times)
+    assert not set(evening) & set(morning)
+
+
+def test_ratings_drift_to_new_films(tmp_path: Path) -> None:
+    log = make_ratings(tmp_path)
+    assert len(log) == RATINGS
+    assert not log.duplicated(["user", "film"]).any()
+    first, later = log[: RATINGS * 8 // 10], log[RATINGS * 9 // 10 :]
+    rows = later.film.map(first.film.value_counts()).fillna(0)
+    assert 0.15 < (rows < 3).mean() < 0.35

@@ -126,6 +126,9 @@ class _ManyRules(PolicyActor):
         excluded: Tensor | None,
     ) -> list[tuple[Tensor, Tensor]]:
         """Items and their probabilities, (M', length) each, of the `rows` part by part."""
+        if excluded is not None:  # a list that would have no item left excludes none
+            left = ~excluded if sessions.offer is None else sessions.offer.mask() & ~excluded
+            excluded = excluded & left.any(1, keepdim=True)
         decisions = []
         most = max(1, _SCORES_AT_ONCE // self._n_items)
         for batch in _batch_rules(self._rule[rows.numpy()], most):

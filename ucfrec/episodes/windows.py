@@ -20,8 +20,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
 
-Steps = tuple[IntArray, IntArray]
-"""Episodes (M,) and steps (M,) of them."""
+Steps = tuple[IntArray, IntArray]  # episodes (M,) and steps (M,) of them
 AUGMENTED = "augmented.safetensors"
 """Name of the file of a run."""
 

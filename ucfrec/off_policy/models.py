@@ -72,7 +72,7 @@ def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tens
     probabilities = batch.log_probabilities.exp()
     target = probabilities.gather(1, column)[:, 0].double() * in_catalogue
     # What the policy thinks of an item counts for the models also where the rule takes the best.
-    scores = batch.scores.log_softmax(-1).clamp(min=_LOWEST_SCORE)
+    scores = batch.scores.log_softmax(-1).nan_to_num(_LOWEST_SCORE).clamp(min=_LOWEST_SCORE)
     mean_score = (probabilities * scores).sum(1)
     score = torch.where(in_catalogue, scores.gather(1, column)[:, 0], mean_score)
     window = batch.returns_left[:, None].float()

@@ -205,8 +205,11 @@ def score_steps(
                 excludes = store.step_values(schema.EXCLUDES_SEEN, owners, begins_at)[rows] > 0
                 pairs = np.unique((rows * n_items + seen_items)[excludes & (seen_items < n_items)])
                 rows, seen_items = np.divmod(pairs, n_items)
-                # A step that would have no item left excludes none.
-                left = np.bincount(rows, minlength=len(first))[rows] < n_items
+                # A decision that would have no item left excludes none.
+                offered = torch.ones(len(first), n_items, dtype=torch.bool)
+                offered = offered if sessions.offer is None else sessions.offer.mask()
+                offered[rows, seen_items] = False
+                left = offered.any(1).numpy()[rows]
                 excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
             scores = scorer.scores_of(query, excluded, earlier)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)

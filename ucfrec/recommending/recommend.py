@@ -121,10 +121,11 @@ def decide(
         histories = batch.with_numbers(trained.items, filter_seen)
         if not (skip_unknown or (histories.item_ids >= 0).all()):
             raise _refuse_unknown(trained.items, [batch, *remaining])
-        # The seed and the time (ms) of the user's last row: a replay draws the same.
+        # The seed, the time (ms) of the user's last row, and `at`: a replay draws the same.
         last = np.zeros(len(batch.users), dtype=np.int64)
         np.maximum.at(last, batch.owner, batch.timestamps)
-        requests = np.asarray([f"{seed}-{time}" for time in last.tolist()], dtype=object)
+        when = "" if chooser.at_ms is None else f"-{chooser.at_ms}"
+        requests = np.asarray([f"{seed}-{time}{when}" for time in last.tolist()], dtype=object)
         new = np.full(len(histories.users), new_session)
         items, scores, propensities, began = chooser.choose(histories, requests, k, new, excluded)
         left = np.isfinite(scores)

@@ -82,9 +82,8 @@ def fit_policy(
     if solve is not None:
         with distributed.leader_first():
             return _fit_once(policy, solve, folder, validate, config.policy_name, callbacks)
-    timed = schema.TIMESTAMP in train.record.columns and not train.has_offers
-    if isinstance(head, ItemHead) and timed:
-        demand = Demand.of(train, validation, head.mixture)
+    if isinstance(head, ItemHead) and schema.TIMESTAMP in train.record.columns:
+        demand = None if train.has_offers else Demand.of(train, validation, head.mixture)
         if demand is not None:
             head.follow(demand, prior)
     size, rows = config.train.batch_size, distributed.share(config.train.batch_size)

@@ -49,8 +49,7 @@ _CRM_EPOCHS = 5
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
-    """The training and the validation episodes of a store; where sessions are users, these go on
-    from what the users were shown before.
+    """The training and the validation episodes of a store; sessions that are users go on in these.
 
     Without a validation split, every tenth training episode is held out for validation.
 

@@ -29,11 +29,8 @@ _PRIOR = 20.0
 """Rows with the mean reward that are added to those of an item."""
 _ENTRIES = 2**24
 """Most rates that are kept."""
-_ROUNDS = 100
-_NO_DRIFT = 100.0
-_STEADY = 0.9
-"""Held-out steps that are added to those for "all steps count alike", whose weight from `_STEADY`
-on means that they do."""
+_ROUNDS, _NO_DRIFT, _STEADY = 100, 100.0, 0.9
+"""Held-out steps added to those for "all count alike", whose weight from `_STEADY` on decides."""
 _OLDEST = 30.0
 """Days from which on an item is as old as any."""
 
@@ -152,10 +149,8 @@ class Demand:
                 mixture = torch.from_numpy(weights[:, 0]).float()
         if mixture[-1] == 1:
             return None
-        mixed = np.zeros((len(counts) + 1, counts.shape[1]))
-        for weight, hours in zip(mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True):
-            if weight:
-                mixed += weight * shares(hours)
+        weighted = zip(mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True)
+        mixed = sum(weight * shares(hours) for weight, hours in weighted if weight)
         return Demand(bins, mixture, torch.from_numpy(np.log(mixed)).float())
 
 

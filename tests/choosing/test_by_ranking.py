@@ -29,7 +29,7 @@ from ucfrec.reporting.model_card import describe_user_model
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
-from ucfrec.runs.start import training_views
+from ucfrec.runs.start import continue_users, training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
 
@@ -64,8 +64,10 @@ def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
 
 def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Path) -> None:
     trained = TrainedPolicy.load(folder / "run")
-    _, validation = training_views(EpisodeStore.open(folder / "store"))
+    train, validation = training_views(EpisodeStore.open(folder / "store"))
+    validation = continue_users(validation, train)  # as users have been shown the training rows
     episodes, steps = validation.all_steps()
+    assert (steps > 0).all()
     liked = liked_rewards(validation, validation.column("reward"))
     items = validation.step_values("item", episodes, steps)
     candidates = read_json(folder / "run" / "candidates.json")

@@ -29,7 +29,7 @@ from tests.support.episodes import (
 from ucfrec import schema
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import AugmentedEpisodes, Sessions, TrainingEpisodes
+from ucfrec.episodes.windows import AugmentedEpisodes, Sessions, TrainingEpisodes, draw_ends
 
 USERS = 3
 
@@ -206,3 +206,21 @@ def test_what_is_saved_is_read(tmp_path: Path, copies: int) -> None:
     for name, values in vars(augmented).items():
         assert getattr(read, name).dtype == values.dtype
         assert np.array_equal(getattr(read, name), values)
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=6), st.integers(1, 5))
+def test_no_step_is_in_less_than_half_as_many_windows(lengths: list[int], length: int) -> None:
+    sizes, counts = np.array(lengths), [np.zeros(n) for n in lengths]
+    total = int(sizes.sum()) + (length - 1) * len(sizes)
+    episodes, ends = draw_ends(AllInTurn(), total, np.cumsum(sizes), sizes, length)  # type: ignore[arg-type]
+    for episode, end in zip(episodes, ends, strict=True):
+        counts[episode][max(0, end - length + 1) : end + 1] += 1
+    assert length <= min(map(min, counts)) <= max(map(max, counts)) < 2 * length
+
+
+class AllInTurn:
+    """Draws every number once."""
+
+    def integers(self, high: int, size: int) -> np.ndarray:
+        assert high == size
+        return np.arange(high)

@@ -5,15 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.policies.test_ucf import (
-    CATALOG,
-    ITEMS,
-    VECTORS,
-    K,
-    random_windows,
-    sessions_of,
-    trained,
-)
+from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, K, random_windows, sessions_of, trained
 from tests.policies.test_ucf import build as build_plain
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer

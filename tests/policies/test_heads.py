@@ -15,6 +15,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Exposed
 from ucfrec.policies import heads
 from ucfrec.policies.heads import ItemHead, Proposal, VectorHead
+from ucfrec.user_model.running import HALF_LIVES_OF_DEMAND, Demand, TimeBins
 
 N, DIM = 60, 8
 
@@ -202,3 +203,21 @@ def test_rare_items_are_drawn_evenly_and_popular_ones_by_their_counts() -> None:
     assert float(share[0] / share[1]) == pytest.approx(1)
     assert float(share[:1000].sum()) > 0.49
     assert 2.9 < float(share[1000] / share[1001]) < 3
+
+
+def test_logits_follow_demand_at_the_time_of_training_steps_and_the_latest_in_acting() -> None:
+    head, features = item_head(), torch.randn(3, DIM)
+    logs = torch.randn(3, N).log_softmax(1)
+    mixture = torch.eye(len(HALF_LIVES_OF_DEMAND))[0]
+    head.follow(Demand(TimeBins(100, 10, 2), mixture, logs))
+    nothing = torch.zeros(3, 0)
+    exposed = Exposed(nothing.long(), nothing, torch.zeros(3), times=torch.tensor([99, 112, 500]))
+    items = torch.tensor([0, 3, N - 1])
+    of_network = features @ head.vectors(torch.arange(N)).T / DIM**0.5 + head.bias - head.prior
+    for rows in ([0, 1, 2], [2, 2, 2]):  # in training, then in evaluation mode
+        expected = of_network + logs[rows]
+        torch.testing.assert_close(head.predict(features, exposed), expected)
+        torch.testing.assert_close(head.predict(features, exposed, items), expected[:, items])
+        of_items = expected.gather(1, items.unsqueeze(1))[:, 0]
+        torch.testing.assert_close(head.logit(features, items, exposed), of_items)
+        head.eval()

@@ -17,12 +17,7 @@ from ucfrec.errors import InputError
 from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import fit_effects
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
-from ucfrec.user_model.reward_report import (
-    RewardRows,
-    calibrate,
-    calibration_error,
-    score_rows,
-)
+from ucfrec.user_model.reward_report import RewardRows, calibrate, calibration_error, score_rows
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
 

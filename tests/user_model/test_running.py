@@ -12,13 +12,7 @@ from tests.support.logs import START, store_of, write
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.user_model.running import (
-    AGES,
-    HALF_LIVES,
-    HALF_LIVES_OF_DEMAND,
-    Demand,
-    RunningRates,
-)
+from ucfrec.user_model.running import AGES, HALF_LIVES, HALF_LIVES_OF_DEMAND, Demand, RunningRates
 
 HOUR, DAY, ITEMS = 3_600_000, 86_400_000, 60
 ALL_ALIKE = torch.tensor(HALF_LIVES_OF_DEMAND).isinf().float()

@@ -251,10 +251,8 @@ def edit_states(
             s, a, r = factual.states, factual.actions, factual.rewards
             proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
-            factual, z = (
-                replace(factual, states=s, actions=a, rewards=r),
-                exact.abduct(s, a, r),
-            )
+            factual = replace(factual, states=s, actions=a, rewards=r)
+            z = exact.abduct(s, a, r)
             proposals = proposed.double()
             passed = accept(exact, factual, z, proposals, epsilon_r * _LESS, rho_high * _LESS)
             moves.add(exact.moves(s[passed], proposals[passed]).cpu())

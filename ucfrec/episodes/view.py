@@ -404,8 +404,8 @@ class EpisodeView:
         return counts
 
     def draw_steps(self, generator: np.random.Generator, count: int, length: int = 1) -> Steps:
-        """Steps drawn uniformly, with replacement; or ends of windows of this `length`, such that
-        every step is in as many windows as any other."""
+        """Steps drawn uniformly, with replacement; or ends of windows of this `length` = K, such
+        that of all equally likely windows a step is in K to 2K − 1, the last ones as well."""
         return draw_ends(generator, count, self._ends, self.lengths, length)
 
     def locate(self, numbers: IntArray) -> tuple[IntArray, IntArray]:

@@ -90,7 +90,7 @@ class SequencePolicy(nn.Module, ABC):
     items_only: ClassVar[str] = ""
     """Name of a policy that recommends items and refuses vectors; empty for others."""
     counts_steps_alike: ClassVar[bool] = False
-    """Whether windows are drawn so that every step is in as many; otherwise their ends are."""
+    """Whether all steps are in about as many windows; otherwise the ends of these are uniform."""
     refits_fully: ClassVar[bool] = False
     """Whether a refit takes as many steps as the training did, not a share of the best weights'."""
     presets: ClassVar[Mapping[str, Any]] = {}

@@ -135,13 +135,10 @@ class ItemHead(nn.Module):
         self.prior.copy_(torch.log(self.counts / totals))
         self.bias.data.copy_(self.prior)
 
-    def follow(self, demand: Demand, prior: Tensor | None = None) -> None:
+    def follow(self, demand: Demand) -> None:
         """Add to the bias by how much the items' shares at the time of a training step, and in
         evaluation mode the latest, exceed what the bias began with, so that the network learns what
-        demand does not say. A bias that other steps taught is moved to the `prior` of these."""
-        if prior is not None:
-            self.bias.data.add_(prior - self.prior)
-            self.prior.copy_(prior)
+        demand does not say."""
         self.mixture.copy_(demand.mixture)
         self.recency.copy_(demand.logs[-1] - self.prior)
         self._demand = replace(demand, logs=demand.logs.to(self.prior))

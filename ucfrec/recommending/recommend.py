@@ -429,13 +429,7 @@ class ItemIndex:
         items, scores = candidates.gather(1, best), scores.gather(1, best)
         short = torch.isneginf(scores[:, -1])
         sampled = torch.zeros(len(short), dtype=torch.bool)
-        sampled[
-            self._rng.choice(
-                len(short),
-                size=-(-len(short) // _SAMPLE),
-                replace=False,
-            )
-        ] = True
+        sampled[self._rng.choice(len(short), size=-(-len(short) // _SAMPLE), replace=False)] = True
         for row in torch.nonzero(short | sampled)[:, 0].tolist():
             items_out = left_out[1][left_out[0] == row]
             row_out = torch.zeros_like(items_out), items_out

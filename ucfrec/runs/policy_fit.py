@@ -52,22 +52,22 @@ def fit_policy(
     """
     k, device, folder = policy.config.context, policy.state_mean.device, out / "policy"
     solve = policy.make_solver(train, validation, folder, config.seed)
-    head, prior = policy.head, None
     if start is not None:
-        prior = head.prior.clone() if isinstance(head, ItemHead) else None
         weights = load_tensors(start)[0]
         names = policy.state_dict().keys() if solve is None else policy.chosen
         policy.load_state_dict({name: weights[name] for name in names}, strict=solve is None)
     alone = solve is not None or distributed.processes() == 1
     windows = []
+    # Where items do not come and go, one without training steps cannot be learned.
     learnable = train.item_counts() > 0 if train.has_items and not train.has_offers else None
     if validation is not None:
         generator = np.random.default_rng([config.seed, 0])
         for number in range(_VALIDATION_BATCHES):
             episodes, steps = validation.draw_steps(generator, _VALIDATION_BATCH)
-            if learnable is not None:  # an item without training steps cannot be learned
+            if learnable is not None:
                 items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-                episodes, steps = episodes[learnable[items]], steps[learnable[items]]
+                if (inside := learnable[items]).any():
+                    episodes, steps = episodes[inside], steps[inside]
             if alone or number % distributed.processes() == distributed.rank():
                 windows.append(validation.windows(episodes, steps, k))
 
@@ -82,10 +82,10 @@ def fit_policy(
     if solve is not None:
         with distributed.leader_first():
             return _fit_once(policy, solve, folder, validate, config.policy_name, callbacks)
-    if isinstance(head, ItemHead) and schema.TIMESTAMP in train.record.columns:
-        demand = None if train.has_offers else Demand.of(train, validation, head.mixture)
+    if isinstance(policy.head, ItemHead) and schema.TIMESTAMP in train.record.columns:
+        demand = None if train.has_offers else Demand.of(train, validation, policy.head.mixture)
         if demand is not None:
-            head.follow(demand, prior)
+            policy.head.follow(demand)
     size, rows = config.train.batch_size, distributed.share(config.train.batch_size)
     newest = np.array([], dtype=np.int64) if newest is None else newest
     recent = train.select(newest)

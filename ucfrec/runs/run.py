@@ -42,6 +42,7 @@ from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import CANDIDATES, RUN, RunRecord, place_of, read_augmentation
 from ucfrec.runs.start import (
     begin,
+    continue_users,
     new_policy,
     require_startable,
     rule_to_start_from,
@@ -234,8 +235,9 @@ def _prepare_inputs(
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:
+        held_out = continue_users(held_out, logged)
         view, validation = (
-            episodes.with_return_to_go(record.return_to_go) for episodes in (view, validation)
+            episodes.with_return_to_go(record.return_to_go) for episodes in (view, held_out)
         )
     if view is not train:
         policy = new_policy(view, config)

@@ -38,7 +38,7 @@ _SHARE = 1 / 16
 """Steps of a warm training, as a share of those of one from scratch."""
 _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
-_SCALES = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
+_SCALES = ("state_mean", "state_std", "return_scale", "lowest_return_to_go", "head.prior")
 """Buffers of a policy that its weights were trained with."""
 _OFFERED = 2**28
 """Most pairs of a step and an item of which it is asked whether the item was on offer, …"""
@@ -49,7 +49,7 @@ _CRM_EPOCHS = 5
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
-    """The training and the validation episodes of a store; sessions that are users go on in these.
+    """The training and the validation episodes of a store.
 
     Without a validation split, every tenth training episode is held out for validation.
 
@@ -64,12 +64,18 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
             "the store so that fewer episodes are held out"
         )
     if validation.n_episodes:
-        if store.has_users and store.record.source.session_by == "user":
-            users = validation.episode_values(schema.USER)
-            validation = UserRows.of(validation, users, train).continue_sessions(None)
         return train, validation
     held_out = np.arange(train.n_episodes) % 10 == 1
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
+
+
+def continue_users(later: EpisodeStore, train: EpisodeStore) -> EpisodeStore:
+    """Later episodes with the training steps of their users before them, where sessions are users;
+    otherwise as they are. What `all_steps` lists does not change."""
+    if not train.has_users or train.record.source.session_by != "user":
+        return later
+    users = later.episode_values(schema.USER)
+    return UserRows.of(later, users, train).continue_sessions(None)
 
 
 def require_startable(
@@ -155,11 +161,7 @@ def begin(
     returns = people.returns
     if not returns_to_go.per_session:
         returns = people.with_return_to_go(returns_to_go).column(schema.RETURN_TO_GO)
-    places = np.linspace(
-        0,
-        len(returns) - 1,
-        min(len(returns), _MOST_RETURNS),
-    ).astype(np.int64)
+    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
     returns = np.sort(returns)[places].astype(np.float32)
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
@@ -174,7 +176,7 @@ def begin(
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
             entries["reference_losses"] = {
-                name: _mean_loss(validation, scores)
+                name: _mean_loss(validation, scores, counts.shown)
                 for name, scores in (
                     ("uniform", torch.zeros(len(counts.shown))),
                     # As the bias of `ItemHead` is initialised.
@@ -196,12 +198,15 @@ def _count_even_draws(train: EpisodeStore) -> Tensor | None:
     return counts * (train.n_steps / max(1, steps))
 
 
-def _mean_loss(view: EpisodeStore, scores: Tensor) -> float:
-    """Mean −log softmax (nats), over what was on offer, of the scores (n_items,) of items shown."""
+def _mean_loss(view: EpisodeStore, scores: Tensor, counts: Tensor) -> float:
+    """Mean −log softmax (nats), over what was on offer, of the scores (n_items,) of items shown; of
+    those with training steps, by `counts` (n_items,), as in `fit_policy`."""
     losses = []
     for offer, items in _sample_offers(view):
         if offer is None:
             items = torch.from_numpy(view.column(schema.ITEM)).long()
+            learnable = items[counts[items] > 0]
+            items = learnable if len(learnable) else items
             return -float(scores.log_softmax(0)[items].double().mean())
         offered = offer.mask().scatter(1, items.unsqueeze(1), True)
         logs = scores.masked_fill(~offered, -torch.inf).log_softmax(1)

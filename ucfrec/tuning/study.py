@@ -33,6 +33,7 @@ from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import format_value, markdown_table
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run
+from ucfrec.runs.start import continue_users
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -71,11 +72,13 @@ def measure_run(
         if rule is None or rule.estimate is None:
             raise InputError(f"this training {_NO_VALUE}")
         return rule.estimate.value
-    validation = store.split("validation")
+    train, validation = store.split("train"), store.split("validation")
+    if not trained.record.return_to_go.per_session:
+        validation = continue_users(validation, train)
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users)
     ranker, k = PolicyRanker(trained).scores, min(k, period.n_items)
-    rows = UserRows.of(validation, users, store.split("train"))
+    rows = UserRows.of(validation, users, train)
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
     above, below = measure(period, ranked)[_MEASURES[metric]]
     if not below.any():

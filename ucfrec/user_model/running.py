@@ -23,14 +23,18 @@ _HOUR_MS = 3_600_000
 HALF_LIVES = (6.0, 24.0, 96.0, math.inf)
 """Hours after which a row counts half, one rate each."""
 HALF_LIVES_OF_DEMAND = (6.0, 24.0, 96.0, 384.0, 1536.0, 6144.0, math.inf)
+"""Hours, as above, of shares that are mixed."""
 AGES = 2
 """Inputs of an item's age: in days, and the logarithm of its hours and 1."""
 _PRIOR = 20.0
 """Rows with the mean reward that are added to those of an item."""
 _ENTRIES = 2**24
 """Most rates that are kept."""
-_ROUNDS, _NO_DRIFT, _STEADY = 100, 100.0, 0.9
-"""Held-out steps added to those for "all count alike", whose weight from `_STEADY` on decides."""
+_ROUNDS = 100
+_NO_DRIFT = 100.0
+"""Held-out steps that are added to those that speak for all steps alike."""
+_STEADY = 0.9
+"""Weight of all steps alike from which on demand counts as steady."""
 _OLDEST = 30.0
 """Days from which on an item is as old as any."""
 
@@ -44,34 +48,31 @@ class TimeBins(NamedTuple):
 
     @classmethod
     def of(cls, view: EpisodeStore, numbers: int) -> "TimeBins":
-        """Bins of an hour or more, of the steps of a view, for so many `numbers` each."""
+        """Bins of the steps of a view, of an hour or more, that have `numbers` numbers each."""
         times = view.column(schema.TIMESTAMP)
         begin, span = int(times.min()), int(times.max() - times.min()) + 1
         number = min(max(1, _ENTRIES // numbers - 1), -(-span // _HOUR_MS))
         return cls(begin, -(-span // number), number)
 
     def rows(self, times: Tensor) -> Tensor:
-        """Numbers (...) of what was known at times (...), ms: 0 to T."""
+        """Rows (...), 0 to T, of what `decay` returns, that were known at times (...), ms."""
         return ((times - self.begin) // self.width).clamp(0, self.number)
 
     def sum(self, view: EpisodeStore, weights: Float64Array | None = None) -> Float64Array:
         """(T, n_items) sums by bin and item of the weights (N,) of the steps; None counts them."""
         n_items = len(view.item_states.embeddings)
         bins = (view.column(schema.TIMESTAMP) - self.begin) // self.width
-        sums = np.bincount(
-            bins * n_items + view.column(schema.ITEM), weights, self.number * n_items
-        )
+        places = bins * n_items + view.column(schema.ITEM)
+        sums = np.bincount(places, weights, self.number * n_items)
         return sums.astype(np.float64).reshape(self.number, n_items)
 
     def decay(self, sums: Float64Array, hours: float) -> Float64Array:
         """Of sums (T, n) by bin, those (T + 1, n) until the begin of each bin, and after the last,
         where what is `hours` old counts half."""
-        decay, totals = (
-            0.5 ** (self.width / _HOUR_MS / hours),
-            np.zeros((len(sums) + 1, sums.shape[1])),
-        )
+        factor = 0.5 ** (self.width / _HOUR_MS / hours)
+        totals = np.zeros((len(sums) + 1, sums.shape[1]))
         for number, values in enumerate(sums):
-            totals[number + 1] = decay * totals[number] + values
+            totals[number + 1] = factor * totals[number] + values
         return totals
 
 

@@ -26,6 +26,8 @@ OBSERVATION = "observation"
 SESSION_BEGAN = "session_began"
 """Time (ms) at which the session of the decision began: with sessions by gap, it says more than a
 pause between rows."""
+CLOCKS_DIFFER_MS = 60_000
+"""By how much the clock that said when a session began may differ from that of the rows."""
 EXCLUDES_SEEN = "excludes_seen"
 """Whether items that the user had been shown before were not on offer."""
 

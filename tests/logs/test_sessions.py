@@ -64,3 +64,15 @@ def test_rows_before_the_one_that_precedes_them_in_time_are_out_of_order(tmp_pat
     path = write_log(tmp_path, np.array([3, 1, 2, 7, 7, 5]), user_id=[1, 1, 1, 2, 3, 3])
     report = validate([path], LogMapping(), PrepareOptions(split=(1.0, 0.0, 0.0)))
     assert report["unsorted_rows"] == 2
+
+
+@pytest.mark.parametrize("skew", [-50, 0, 50])
+def test_clocks_that_differ_do_not_split_sessions(tmp_path: Path, skew: int) -> None:
+    minutes = np.array([0, 5, 10, 11, 16]) * 60_000 + START  # a session begins after 11
+    began = np.array([minutes[0], *[minutes[0] + skew] * 2, minutes[3], minutes[3] + skew])
+    parts = {"user_id": np.repeat(np.arange(20), 5), "item_id": np.arange(100) % 7}
+    log = pd.DataFrame({**parts, "reward": np.arange(100) % 2, "timestamp": np.tile(minutes, 20)})
+    log.assign(session_began=np.tile(began, 20)).to_parquet(tmp_path / "log.parquet")
+    options = PrepareOptions(session_by="gap", reward="reward", split=(1.0, 0.0, 0.0))
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
+    assert EpisodeStore.open(tmp_path / "store").lengths.tolist() == [3, 2] * 20

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.support.logs import START
 from tests.support.served import (
     FULL,
     OBSERVED,
@@ -28,6 +29,7 @@ from tests.support.served import (
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import Expression
+from ucfrec.logs.histories import frame_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
@@ -36,6 +38,8 @@ from ucfrec.recommending.responder import Answer, Responder, Served, arm_of, par
 from ucfrec.runs.promoted import POINTER, promote, promote_back
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+REWARD = Expression("reward", "run.json")
 
 
 def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:
@@ -186,12 +190,22 @@ def test_rewards_are_computed_from_feedback(
 
 
 def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> None:
-    reader = HistoryReader("last", False, 2, RowRewards(Expression("reward", "run.json")))
+    reader = HistoryReader("last", False, 2, RowRewards(REWARD))
     row = {"item_id": 1, "timestamp": 1.7e12, "reward": 0, "observation": [1, -2.5]}
     (seen,) = reader.read([Row(**row)], 1).observations  # type: ignore[typeddict-item]
     assert seen.tolist() == [1.0, -2.5]
     with pytest.raises(InputError, match="numbers beyond"):
         reader.read([Row(**{**row, "observation": [1, -1e39]})], 1)  # type: ignore[typeddict-item]
+
+
+def test_rows_of_a_list_are_read_in_its_order() -> None:
+    rng, reader = np.random.default_rng(0), HistoryReader("last", False, 0, RowRewards(REWARD))
+    log = pd.DataFrame({"item_id": rng.permutation(20), "position": rng.permutation(20) + 1})
+    log = log.assign(reward=0.0, timestamp=START + np.repeat([5, 9, 9, 9], 5))
+    (batch,) = frame_histories(log.assign(user_id=1), LogMapping(), "reward", 100)
+    expected = log.sort_values(["timestamp", "position"]).item_id.tolist()
+    rows = log.to_dict("records")
+    assert reader.read(rows, 1).item_ids.tolist() == batch.item_ids.tolist() == expected
 
 
 # Runs that share the users, and a run that is replaced as the server runs.

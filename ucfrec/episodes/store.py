@@ -402,7 +402,8 @@ class UserRows:
         users, low = np.unique(self.first), times.min()
         owner = np.searchsorted(users, np.arange(len(times)), side="right")
         span = times.max() - low + 1
-        keys, wanted_keys = owner * span + times - low, (began - low).clip(0, span - 1)
+        since = np.where(began == times[begin], began, began - schema.CLOCKS_DIFFER_MS)
+        keys, wanted_keys = owner * span + times - low, (since - low).clip(0, span - 1)
         starts_named = np.searchsorted(keys, owner[begin] * span + wanted_keys)
         return np.where(began < 0, begins, np.minimum(starts_named, begin))
 

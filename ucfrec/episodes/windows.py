@@ -76,11 +76,6 @@ class Windows(_Rows):
         """(B, K) bool, the steps whose actions are predicted: first rows of decisions."""
         return self.mask if self.decides is None else self.mask & self.decides
 
-    def __repr__(self) -> str:
-        (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
-        actions = "items" if items else f"vectors of {self.actions.shape[2]}"
-        return f"Windows({windows:,} of {steps} steps, states of {size}, actions are {actions})"
-
     @classmethod
     def of(
         cls,

@@ -467,7 +467,10 @@ def choose_rows(
     keys = [users, times, ties, items]
     order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
     first = np.append(True, np.any([np.diff(key[order]) != 0 for key in keys], axis=0))
-    return np.asarray(order[first & finite[order]])
+    order = order[first & finite[order]]
+    if schema.POSITION in rows:  # a list, in its order
+        order = order[np.lexsort([rows[schema.POSITION][order], times[order], users[order]])]
+    return np.asarray(order)
 
 
 def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:

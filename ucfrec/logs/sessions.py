@@ -119,8 +119,9 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
             pause = times[1:] - times[:-1] > cut.gap_ms
             if schema.SESSION_BEGAN in batch:
                 previous, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
-                is_other = np.where(previous < 0, began > times[:-1], began != previous)
-                pause = np.where(began < 0, pause, is_other)
+                moved = np.abs(began - previous) > schema.CLOCKS_DIFFER_MS
+                is_other = np.where(previous < 0, began > times[:-1], moved)
+                pause = np.where(began < 0, pause, is_other | (began == times[1:]))
             ends = user_ends | np.append(pause & (batch[schema.PLACE][1:] == 0), True)
             last_ends = rows.last_ms - times > cut.gap_ms
         elif cut.session_by == schema.SESSION_ID:

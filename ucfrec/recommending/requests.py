@@ -103,6 +103,7 @@ class Row(TypedDict):
         Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]
     ]
     session_id: NotRequired[Id]
+    position: NotRequired[Annotated[Number, Field(description="Place in the list shown.")]]
     observation: NotRequired[Annotated[list[Number], Field(max_length=100_000, fail_fast=True)]]
 
 
@@ -298,6 +299,7 @@ class HistoryReader(NamedTuple):
             schema.TIMESTAMP: np.asarray(_read_times(rows), dtype=np.int64),
             schema.ITEM: items,
             "row": np.arange(len(rows)),
+            schema.POSITION: np.asarray([row.get("position", np.inf) for row in rows], dtype=float),
         }
         sessions = None
         if self.by_session_id:

@@ -74,8 +74,7 @@ def continue_users(later: EpisodeStore, train: EpisodeStore) -> EpisodeStore:
     otherwise as they are. What `all_steps` lists does not change."""
     if not train.has_users or train.record.source.session_by != "user":
         return later
-    users = later.episode_values(schema.USER)
-    return UserRows.of(later, users, train).continue_sessions(None)
+    return UserRows.of(later, later.episode_values(schema.USER), train).continue_sessions(None)
 
 
 def require_startable(

@@ -38,6 +38,7 @@ from ucfrec.recommending.export import (
     GRAPH,
     OUTPUTS,
     _run_graph,
+    compile_scores,
     export,
     find_best,
     measure_magnitude,
@@ -232,6 +233,14 @@ def ending(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
 @pytest.fixture(scope="module")
 def fast(ending: TrainedPolicy) -> Responder:
     return responder(ending, rule=replace(FULL, lookahead=2.0), k=24, engine=ONNXRUNTIME)
+
+
+def test_a_lookahead_over_items_that_come_and_go_is_refused(ending: TrainedPolicy) -> None:
+    model = copy.deepcopy(ending.reward_model)
+    model.running = nn.Buffer(torch.ones(6))
+    scorer = replace(ending, reward_model=model).item_scorer(AHEAD)
+    with pytest.raises(InputError, match=r"a lookahead depends on the time, .* --engine torch"):
+        compile_scores(scorer, "ucf")
 
 
 @pytest.mark.slow

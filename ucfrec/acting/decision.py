@@ -128,11 +128,7 @@ class DecisionRule:
         return config_hash(self.as_dict())
 
     def target_returns(self, returns: ReturnToGo, collected: Tensor) -> Tensor:
-        """Target returns at the next step, (B,) float64, in reward units.
-
-        Args:
-            collected: (B,) rewards earlier in the session.
-        """
+        """Target returns at the next step, (B,) float64, of sessions that have `collected` (B,)."""
         targets = returns.target_returns(self.target, collected)
         return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 

@@ -104,13 +104,7 @@ def joint_means(means: Mapping[str, float], count: float) -> dict[str, float]:
     values = torch.tensor([*(mean * count for mean in means.values()), count], dtype=torch.float64)
     if processes() > 1:
         distributed.all_reduce(values)
-    return dict(
-        zip(
-            means,
-            (values[:-1] / values[-1]).tolist(),
-            strict=True,
-        )
-    )
+    return dict(zip(means, (values[:-1] / values[-1]).tolist(), strict=True))
 
 
 def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:

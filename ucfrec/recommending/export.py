@@ -198,9 +198,13 @@ def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Te
 
     Raises:
         InputError: the extra `export` is not installed, the policy scores items in a way of its own
-            or cannot be exported, or what the graph gives differs from torch's.
+            or cannot be exported, the rule looks ahead over items that come and go, or what the
+            graph gives differs from torch's.
     """
     require_installed()
+    model = scorer.reward_model
+    if scorer.rule.looks_ahead and model is not None and model.running.any():
+        raise InputError(f"a lookahead depends on the time, as items come and go; {_TORCH}")
     network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
     example = _draw_inputs(scorer, 1, seed=0, mask=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -30,6 +30,8 @@ def recommend_with_spark(
     master: str,
     k: int = 10,
     *,
+    filter_seen: bool = True,
+    at: str | float | None = None,
     exposures: Path | None = None,
     checkpoint: str = "best",
     rule: DecisionRule | None = None,
@@ -47,12 +49,13 @@ def recommend_with_spark(
         exposures: folder for what was shown; None for none.
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
-        how: `filter_seen`, `skip_unknown`, `new_session` and `seed` of `recommend`.
+        filter_seen, at, how: as of `recommend`; `how` are `skip_unknown`, `new_session` and `seed`.
 
     Raises:
         InputError: an argument or the logs cannot be used, or Spark is missing or fails.
     """
-    recommended: Any = partial(decide, k=k, rule=rule or trained.rule, **how)
+    how |= {"k": k, "rule": rule or trained.rule, "filter_seen": filter_seen, "at": at}
+    recommended: Any = partial(decide, **how)
     recommended(trained, ())  # checks the arguments
     columns = columns_used(trained, mapping)
     log = UserLog(files, columns, reward_of(trained), session_by(trained))

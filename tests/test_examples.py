@@ -141,9 +141,13 @@ def test_the_publisher_trains_where_sessions_see_all_there_is(tmp_path: Path) ->
     settings = [*SETTINGS, "train.steps=10", "policy.dim=8"]
     recommender = Recommender("dt", settings=settings)
     recommender.fit(EpisodeStore.open(tmp_path / "store"), tmp_path / "run", refit=False)
-    times = "2026-10-18T20:00", "2026-10-18T08:00"
-    evening, morning = (recommender.recommend(k=4, at=time).request_id for time in times)
-    assert not set(evening) & set(morning)
+    evening, morning = pd.Timestamp("2026-10-18T20:00"), "2026-10-18T08:00"
+    frames = [recommender.recommend(k=4, at=time) for time in (evening, morning)]
+    frames += [recommender.recommend(k=4, at=evening, candidates=frames[0].item_id.iloc[:9])]
+    assert not set.intersection(*(set(frame.request_id) for frame in frames))
+    rows = recommender.trained.require_store("").to_frame()
+    earlier = rows[rows.timestamp < evening.value // 10**6]
+    pd.testing.assert_frame_equal(recommender.recommend(earlier, k=4, at=evening), frames[0])
 
 
 def test_ratings_drift_to_new_films(tmp_path: Path) -> None:

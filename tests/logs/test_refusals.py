@@ -206,17 +206,9 @@ LOGS: dict[str, tuple[Act, str]] = {
         ),
         r"observation is missing .* in 9 of 18 rows",
     ),
-    **{f"unsettled {form}": (
-        parts_with(dated(form), names=f"{{}}{suffix}"),
-        f"3 January or 1 March\\? .*--time-format '%d{form[2]}%m{form[2]}%Y …' or '%m{form[2]}%d",
-    ) for form, suffix in (("%m/%d/%Y", ".csv"), ("%m-%d-%Y %I:%M:%S %p", ".parquet"))},
-    "parts with other dates": (
-        parts_with(dated("%m/%d/%Y", days=31), dated("%d/%m/%Y", days=31)),
-        "the day first in some files and the month in others",
-    ),
-    "a part with both dates": (
-        parts_with(random_log().assign(timestamp=["03/13/2024", "13/03/2024"] * 200)),
-        "neither day/month nor month/day reads every row",
+    "a part with another kind of time": (
+        parts_with(dated("%Y-%m-%d"), dated("%m/%d/%Y")),
+        r"1\.csv: timestamp \(timestamp\) is '03/01/2024', no ISO 8601 time nor milliseconds",
     ),
     "other times": (
         parts_with(dated("%d %b %Y %H:%M")),

@@ -69,7 +69,9 @@ def test_rows_before_the_one_that_precedes_them_in_time_are_out_of_order(tmp_pat
 @pytest.mark.parametrize("skew", [-50, 0, 50])
 def test_clocks_that_differ_do_not_split_sessions(tmp_path: Path, skew: int) -> None:
     minutes = np.array([0, 5, 10, 11, 16]) * 60_000 + START  # a session begins after 11
-    began = np.array([minutes[0], *[minutes[0] + skew] * 2, minutes[3], minutes[3] + skew])
+    # The third row is of a client that sends its latest row alone.
+    began = np.array([0, 0, minutes[1] - minutes[0], 0, 0]) + minutes[[0, 0, 0, 3, 3]]
+    began += np.array([0, skew, skew, 0, skew])
     parts = {"user_id": np.repeat(np.arange(20), 5), "item_id": np.arange(100) % 7}
     log = pd.DataFrame({**parts, "reward": np.arange(100) % 2, "timestamp": np.tile(minutes, 20)})
     log.assign(session_began=np.tile(began, 20)).to_parquet(tmp_path / "log.parquet")

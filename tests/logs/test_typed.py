@@ -40,25 +40,6 @@ def test_an_order_of_day_and_month_that_no_row_settles_can_be_said(
     assert range_of(path, LogMapping(time_format=other)) == ["2024-01-03", "2024-11-03"]
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-@pytest.mark.parametrize("written", ["%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M", "%d-%m-%Y, %H:%M:%S"])
-def test_a_day_beyond_12_settles_it(tmp_path: Path, suffix: str, written: str) -> None:
-    # The 13th comes after the first 20,000 rows, at which DuckDB looks.
-    log = make_log(days("2024-03-01", 13, 24_000).strftime(written))
-    path = write(log, tmp_path / f"log{suffix}")
-    assert range_of(path) == ["2024-03-01", "2024-03-13"]
-
-
-@pytest.mark.parametrize("other", [None, "n/a"])
-def test_a_file_without_dates_needs_no_order(tmp_path: Path, other: str | None) -> None:
-    log = make_log(days("2024-03-01", 31).strftime("%m/%d/%Y"))
-    write(log, tmp_path / "a.parquet")
-    without = pd.array([other] * 10, dtype="string")
-    write(log[:10].assign(timestamp=without), tmp_path / "b.parquet")
-    report = validate([tmp_path], LogMapping())
-    assert (report["rows_read"], report["dropped"]["null_key"]) == (3010, 10)
-
-
 @pytest.mark.parametrize(
     ("written", "expected"),
     [

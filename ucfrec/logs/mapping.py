@@ -94,9 +94,12 @@ class LogMapping:
     user_features: tuple[FeatureTable, ...] = ()
     time_format: str | None = None
     """How times are written that are text, as of `strptime`, e.g. "%d/%m/%Y %H:%M"; None for ISO
-    8601, and for dates whose order of day and month is certain."""
+    8601."""
     earliest: str | None = None
     """ISO time (UTC) before which times are clock errors; None for 2000."""
+    before_ms: int | None = None
+    """Time of requests, ms, for which rows from then on are no history; None for any. A file of a
+    mapping does not have it."""
     where: str | None = None
     """SQL condition over the files' columns; rows that do not fulfil it are excluded."""
     partitions: bool = False
@@ -269,7 +272,7 @@ def _require_keys(where: str, table: object, kind: type) -> None:
     """Check that a table of a mapping file has the keys of a class, and no others."""
     if not isinstance(table, dict):
         raise InputError(f"{where}: write it in double brackets, with its keys in lines below")
-    names = [part.name for part in fields(kind) if part.name != "remembered"]
+    names = [part.name for part in fields(kind) if part.name not in ("remembered", "before_ms")]
     for key in table.keys() - set(names):
         raise InputError(f"{where}: there is no key {key!r}; {nearest(key, names)}")
     for part in fields(kind):

@@ -58,6 +58,7 @@ REASONS = {
     "null_key": "user, item or action, time or session is missing",
     "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "
     "more than a day ahead of now",
+    "not_before": "is not before the time of the requests",
     "vector_not_finite": "action is missing or holds NaN or infinity",
     "unknown_item": "item is not in the store",
     "duplicate": "repeats user, item or action, and time of another row, which is kept",
@@ -337,6 +338,8 @@ def mark_faults(
         "null_key": " OR ".join(f"{key} IS NULL" for key in keys if key != schema.ACTION),
         "clock_out_of_range": f"timestamp NOT BETWEEN {log.mapping.earliest_ms} AND {latest}",
     }
+    if log.mapping.before_ms is not None:
+        conditions["not_before"] = f"timestamp >= {log.mapping.before_ms}"
     if schema.ACTION in log.vector_size:
         conditions["vector_not_finite"] = not_finite(schema.ACTION)
     if known_items is not None:

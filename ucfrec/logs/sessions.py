@@ -120,7 +120,10 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
             if schema.SESSION_BEGAN in batch:
                 previous, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
                 moved = np.abs(began - previous) > schema.CLOCKS_DIFFER_MS
-                is_other = np.where(previous < 0, began > times[:-1], moved)
+                # A client that sends its latest rows alone moves the begin, but not past a row.
+                passed = began - times[:-1]
+                moved &= (passed > schema.CLOCKS_DIFFER_MS) | pause
+                is_other = np.where(previous < 0, passed > 0, moved)
                 pause = np.where(began < 0, pause, is_other | (began == times[1:]))
             ends = user_ends | np.append(pause & (batch[schema.PLACE][1:] == 0), True)
             last_ends = rows.last_ms - times > cut.gap_ms

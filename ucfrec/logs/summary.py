@@ -280,7 +280,7 @@ def note_dropped(
     name: str,
     dropped: Mapping[str, int],
     n_read: int,
-    fine: Collection[str] = ("duplicate", "left_out"),
+    fine: Collection[str] = ("duplicate", "left_out", "not_before"),
 ) -> None:
     """Warn of the rows that are left out, with their numbers and reasons, unless all are `fine`;
     `name` is that of the data, or empty."""

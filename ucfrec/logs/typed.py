@@ -1,8 +1,6 @@
 """A log as one relation of typed rows: its columns, its vectors, its times, its reward."""
 
 import re
-from calendar import month_name
-from collections import namedtuple
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,8 +60,6 @@ _TYPES = {
 }
 KEY_OF_LIST = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
 """SQL of the name of a set of candidates that is a list in the log."""
-_DAY_OR_MONTH_FIRST = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
-_OF_DAY = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
 
 
 @dataclass(frozen=True)
@@ -421,11 +417,6 @@ def _unify_ids(
         values[name] = (typed, "")
 
 
-_Survey = namedtuple("_Survey", "filled numbers iso dated first second example strange")
-"""Of the text in a column of one file: how many are what, and of those that begin with the day or
-the month (`dated`) the largest numbers and one; and one that is none of these."""
-
-
 def cast_text_time(
     connection: duckdb.DuckDBPyConnection,
     table: Table,
@@ -435,80 +426,27 @@ def cast_text_time(
 ) -> str:
     """SQL of the milliseconds since 1970 (UTC) that a column of text means, NULL where it is none.
 
-    `time_format` is that of `strptime`, in which all times are written; None for numbers, ISO 8601,
-    and dates whose order of day and month every file settles. Times without a zone are UTC. Raises
-    InputError if none of the text is a time, or the order is not settled.
+    `time_format` is that of `strptime`, in which all times are written; None for numbers and ISO
+    8601. Times without a zone are UTC. Raises InputError if none of the text of a file is a time.
     """
     if time_format is not None:
         time = f"try_strptime(trim({sql}), {quote(time_format)})"
         return f"epoch_ms(TRY(CAST({time} AS TIMESTAMPTZ)))"
-    with explain_errors(connection, (table,)):
-        surveys = [_survey(connection, replace(table, files=(f,)), sql) for f in table.files]
-    numbers, iso = any(s.numbers for s in surveys), any(s.iso for s in surveys)
-    dated = [(file, s) for file, s in zip(table.files, surveys, strict=True) if s.dated]
-    where = f"{table.files[0]}: timestamp ({column})"
-    if dated:
-        if numbers or iso:
-            raise InputError(
-                f"{where} has times of several kinds; say how they are written with "
-                "--time-format, or map an expression"
-            )
-        orders = {_order(file, survey) for file, survey in dated}
-        if len(orders) > 1:
-            raise InputError(
-                f"{where} has the day first in some files and the month in others; prepare "
-                "them apart, each with its --time-format"
-            )
-        order, start = min(orders), quote("^" + _DAY_OR_MONTH_FIRST + "$")
-        plain = rf"trim(regexp_replace(trim({sql}), {start}, '\1/\2/\3 \4'))"
-        # A comma or T before the time of day.
-        plain = rf"regexp_replace({plain}, '\s+[T,]?\s*', ' ')"
-        formats = ", ".join(quote(f"{order}/%Y{of_day}") for of_day in _OF_DAY)
-        return f"epoch_ms(try_strptime({plain}, [{formats}]))"
-    if not (numbers or iso) and any(s.filled for s in surveys):
-        strange = min(s.strange for s in surveys if s.strange is not None)
+    is_time = f"TRY_CAST(x AS DOUBLE) IS NOT NULL OR regexp_full_match(x, {quote(ISO_TIME)})"
+    for file in table.files:
+        texts = f"SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x"
+        counts = f"SELECT count_if({is_time}), min(x) FILTER (NOT ({is_time}))"
+        with explain_errors(connection, (table,)):
+            query = f"{counts} FROM ({texts} FROM {replace(table, files=(file,)).sql})"
+            ((n_times, strange),) = connection.sql(query).fetchall()
+        if n_times or strange is None:
+            continue
         raise InputError(
-            f"{where} is {strange!r:.60}, no ISO 8601 time nor milliseconds; say how it is "
-            "written with --time-format, e.g. '%d %b %Y %H:%M'"
+            f"{file}: timestamp ({column}) is {strange!r:.60}, no ISO 8601 time nor "
+            "milliseconds; say how it is written with --time-format, e.g. '%d/%m/%Y %H:%M'"
         )
     plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
     # DuckDB reads no zone after a blank.
     plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
     time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
     return f"coalesce(TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT), {time})"
-
-
-def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _Survey:
-    iso = f"regexp_full_match(x, {quote(ISO_TIME)})"
-    dated = f"regexp_full_match(x, {quote(_DAY_OR_MONTH_FIRST)})"
-    number = "TRY_CAST(x AS DOUBLE) IS NOT NULL"
-    first, second = (
-        f"max(TRY_CAST(regexp_extract(x, {quote(f'^{_DAY_OR_MONTH_FIRST}$')}, {n}) AS INTEGER))"
-        for n in (1, 2)
-    )
-    (row,) = connection.sql(
-        f"SELECT count(x), count_if({number}), count_if({iso}), count_if({dated}), "
-        f"coalesce({first}, 0), coalesce({second}, 0), min(CASE WHEN {dated} THEN x END), "
-        f"min(CASE WHEN NOT ({number} OR {iso} OR {dated}) THEN x END) "
-        f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"
-    ).fetchall()
-    return _Survey(*row)
-
-
-def _order(file: Path, survey: _Survey) -> str:
-    """How day and month follow each other in a file: "%d/%m" or "%m/%d"."""
-    if (survey.first > 12) != (survey.second > 12):
-        return "%d/%m" if survey.first > 12 else "%m/%d"
-    where, example = f"{file}: timestamp is {survey.example!r:.40}", survey.example
-    if survey.first > 12:
-        raise InputError(
-            f"{where}, and neither day/month nor month/day reads every row; say how times are "
-            "written with --time-format"
-        )
-    first, second = (int(number) for number in re.findall(r"\d+", example)[:2])
-    sign = example.lstrip("0123456789")[:1]
-    raise InputError(
-        f"{where}: {first} {month_name[second]} or {second} {month_name[first]}? No row settles "
-        f"it; add --time-format '%d{sign}%m{sign}%Y …' or '%m{sign}%d{sign}%Y …' with the time of "
-        "day, e.g. %H:%M:%S"
-    )

@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -210,8 +211,9 @@ def read_histories(
     frame: pd.DataFrame | None,
     mapping: Columns | None,
     users: Iterable[Any] | None,
+    before_ms: int | None = None,
 ) -> Iterator[Histories]:
-    """Histories of users: of a frame, or None for what the store of the run has of them.
+    """Histories of users before a time: of a frame, or None for what the store of the run has.
 
     Raises:
         InputError: the frame cannot be used, the store is gone, `users` is no list of ids, or one
@@ -230,7 +232,8 @@ def read_histories(
         columns = [schema.PROPENSITY, schema.IS_RANDOM, schema.SPLIT]
         frame = store.to_frame().drop(columns=columns, errors="ignore")
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
-    histories = histories_of_frame(trained, frame, _read_columns(mapping), stored)
+    renamed = replace(_read_columns(mapping), before_ms=before_ms)
+    histories = histories_of_frame(trained, frame, renamed, stored)
     return histories if ids is None else select_users(histories, ids)
 
 

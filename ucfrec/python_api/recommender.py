@@ -43,7 +43,7 @@ from ucfrec.python_api.given_data import (
 from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.exposures import exposures_written
-from ucfrec.recommending.recommend import decide, similar_items
+from ucfrec.recommending.recommend import decide, read_time, similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
@@ -69,8 +69,12 @@ _checked = check_arguments(
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
         **dict.fromkeys(("reward", "session_by", "dataset", "liked"), require_kind("text", str)),
         **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
+        "exposures": require_kind("a path", str, Path),
         **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
+        **dict.fromkeys(
+            ("filter_seen", "skip_unknown", "new_session"), require_kind("true or false", bool)
+        ),
         "split": read_split,
         "histories": require_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
         "rule": require_kind("a DecisionRule", DecisionRule),
@@ -295,7 +299,7 @@ class Recommender:
             allowed = require_ids("candidates", candidates, schema.ITEM_ID)
         decisions = decide(
             trained,
-            read_histories(trained, histories, mapping, users),
+            read_histories(trained, histories, mapping, users, read_time(at)),
             k,
             rule=rule,
             seed=seed,

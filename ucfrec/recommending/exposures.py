@@ -15,14 +15,13 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-import xxhash
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.parquet import table_writer
-from ucfrec.logs.candidates import ITEMS, write_sets
+from ucfrec.logs.candidates import ITEMS, name_set, write_sets
 from ucfrec.recommending.recommend import RANK, read_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -31,8 +30,10 @@ if TYPE_CHECKING:
 
 _ROWS = 50_000
 _SECONDS = 60.0
+_IDS = 1_000_000
+"""Ids of candidates, each set once, from which on a file is written."""
 _MOST_WAITING = 20
-"""Files' worth of rows that wait while the disk cannot be written; later ones are lost."""
+"""Files' worth of what waits while the disk cannot be written; later rows are lost."""
 
 
 def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
@@ -54,14 +55,6 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             schema.CANDIDATES: pa.string(),
         }
     )
-
-
-def name_set(candidates: Array | None) -> str:
-    """16 hexadecimal digits that name a set of ids, in any order; empty for None, everything."""
-    if candidates is None:
-        return ""
-    ids = map(str, np.unique(candidates).tolist())
-    return xxhash.xxh3_64_hexdigest("\n".join(ids).encode())
 
 
 def _tabulate_sets(sets: Mapping[str, Array | None]) -> pa.Table:
@@ -146,7 +139,7 @@ class ExposureLog:
         self._rows, self._seconds, self._clock = rows, seconds, clock
         self._waiting: list[tuple[str, int, str, Answer]] = []
         self._sets: dict[str, Array | None] = {}
-        self._count, self._lost = 0, 0
+        self._count, self._ids, self._lost = 0, 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
         self._thread.start()
@@ -157,13 +150,15 @@ class ExposureLog:
         now, size = int(self._clock() * 1000), len(answer.items)
         candidates = name_set(answer.candidates)
         with self._lock:
-            if self._count > _MOST_WAITING * self._rows:
+            if max(self._count / self._rows, self._ids / _IDS) > _MOST_WAITING:
                 self._lost += size
                 return
             self._waiting.append((str(user_id), now, candidates, answer._replace(candidates=None)))
-            self._sets[candidates] = answer.candidates
+            if answer.candidates is not None and candidates not in self._sets:
+                self._sets[candidates] = answer.candidates
+                self._ids += len(answer.candidates)
             self._count += size
-            full = self._count >= self._rows
+            full = self._count >= self._rows or self._ids >= _IDS
         if full:
             self._wake.set()
 
@@ -190,7 +185,7 @@ class ExposureLog:
     def _flush(self, last: bool) -> None:
         with self._lock:
             waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
-            sets, self._sets = self._sets, {}
+            sets, self._sets, ids, self._ids = self._sets, {}, self._ids, 0
         if not count:
             return
         name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
@@ -204,7 +199,7 @@ class ExposureLog:
                     self._lost += count
                 else:
                     self._waiting, self._count = waiting + self._waiting, self._count + count
-                    self._sets = sets | self._sets
+                    self._sets, self._ids = sets | self._sets, ids + self._ids
                 what = f"{error}; {self._count:,} rows wait, {self._lost:,} are lost"
             message = f"ucfrec: exposures: {self._folder / name} cannot be written: {what}"
             print(message, file=sys.stderr, flush=True)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,10 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
+from ucfrec.logs.candidates import name_set
 from ucfrec.logs.histories import Histories
 from ucfrec.logs.rows import mix_bits
-from ucfrec.recommending.requests import parse_time
+from ucfrec.recommending.requests import TIME_FORMS, parse_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, require_whole
 
@@ -108,12 +110,17 @@ def decide(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    chooser = Chooser(trained, trained.item_scorer(rule), seed, index, read_time(at))
+    at_ms = read_time(at)
+    if at_ms is None and trained.offers is not None:
+        at_ms = round(time.time() * 1000)
+    chooser = Chooser(trained, trained.item_scorer(rule), seed, index, at_ms)
     k, excluded, remaining = require_whole("k", k), None, iter(batches)
+    told_apart = "" if at_ms is None else f"-{at_ms}"
     if candidates is not None:
         ids = require_ids("candidates", candidates, schema.ITEM_ID)
         excluded = torch.ones(len(trained.items), dtype=torch.bool)
         allowed = candidate_numbers(trained.items, ids, skip_unknown)
+        told_apart += f"-{name_set(trained.items.ids[allowed])}"
         excluded[torch.from_numpy(allowed)] = False
     _require_available(trained, chooser.request_times(1), excluded)
 
@@ -121,11 +128,11 @@ def decide(
         histories = batch.with_numbers(trained.items, filter_seen)
         if not (skip_unknown or (histories.item_ids >= 0).all()):
             raise _refuse_unknown(trained.items, [batch, *remaining])
-        # The seed, the time (ms) of the user's last row, and `at`: a replay draws the same.
+        # The seed, the time (ms) of the user's last row, `at` and candidates: a replay draws the
+        # same.
         last = np.zeros(len(batch.users), dtype=np.int64)
         np.maximum.at(last, batch.owner, batch.timestamps)
-        when = "" if chooser.at_ms is None else f"-{chooser.at_ms}"
-        requests = np.asarray([f"{seed}-{time}{when}" for time in last.tolist()], dtype=object)
+        requests = np.asarray([f"{seed}-{ms}{told_apart}" for ms in last.tolist()], dtype=object)
         new = np.full(len(histories.users), new_session)
         items, scores, propensities, began = chooser.choose(histories, requests, k, new, excluded)
         left = np.isfinite(scores)
@@ -152,18 +159,24 @@ def _require_available(trained: TrainedPolicy, time: Tensor, excluded: Tensor | 
     offered = trained.offers.at(time).mask()
     if not (offered if excluded is None else offered & ~excluded).any():
         clock = pd.Timestamp(int(time), unit="ms")
+        none = "no item" if excluded is None else f"none of {int((~excluded).sum())} candidates"
         raise InputError(
-            f"{trained.folder}: no item is available at {clock:%Y-%m-%d %H:%M} UTC; give the time "
+            f"{trained.folder}: {none} is available at {clock:%Y-%m-%d %H:%M} UTC; give the time "
             "of requests with --at (at=... in Python), or a newer table of items to ucfrec update"
         )
 
 
-def read_time(at: str | float | None) -> int | None:
+def read_time(at: str | float | datetime | None) -> int | None:
     """Milliseconds since 1970 of the time of requests; InputError if it is no time."""
+    if at is None:
+        return None
     try:
-        return None if at is None else round(parse_time(at))
-    except ValueError as error:
-        raise InputError(f"the time of the requests is {at!r:.60}; {error}") from None
+        # What is no time is no valid text either.
+        written = at.isoformat() if isinstance(at, datetime) else at
+        is_number = isinstance(at, int | float) and not isinstance(at, bool)
+        return round(parse_time(written if is_number else str(written)))
+    except (ValueError, OverflowError):
+        raise InputError(f"the time of the requests is {at!r:.60}; {TIME_FORMS}") from None
 
 
 @dataclass(frozen=True)

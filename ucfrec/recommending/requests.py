@@ -56,6 +56,9 @@ _MEMORY = "512MB"
 of it."""
 
 
+TIME_FORMS = "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
+
+
 def parse_time(value: float | str) -> float:
     """A time of a request in milliseconds since 1970; ValueError for text that is not ISO 8601."""
     if not isinstance(value, str):
@@ -66,9 +69,7 @@ def parse_time(value: float | str) -> float:
         time = datetime.fromisoformat(value.strip())
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
     except (ValueError, OverflowError):
-        raise ValueError(
-            "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
-        ) from None
+        raise ValueError(TIME_FORMS) from None
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

@@ -167,8 +167,8 @@ def baselines(
     if train is not None and store is not None and store.split("validation").n_episodes:
         first, validation = store.split("train"), store.split("validation")
         for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
-            hours = kind.best_half_life(first, validation, liked_of)
-            recent = kind.scores_of(TrainingCounts.of(train, liked_of, hours))
+            mixture = kind.choose_mixture(first, validation, liked_of)
+            recent = kind.scores_of(train, mixture, liked_of)
             rankers[f"recent {name}"] = same_for_all(recent.double())
     return rankers
 

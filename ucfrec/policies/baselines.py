@@ -21,12 +21,11 @@ from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
 from ucfrec.user_model.reward_report import draw_numbers
+from ucfrec.user_model.running import HALF_LIVES_OF_DEMAND, fit_mixture
 from ucfrec.user_model.session_end import LEAVES, TREES, BoostedTrees, fit_trees
 
 PRIOR = 10.0
 """Steps at the mean rate that are added to every item's own."""
-HALF_LIVES = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
-"""Hours after which a row counts half; those that are tried."""
 _SMOOTHING = 1.0
 """Likes that are added to all items together."""
 _WITHIN = 0.999
@@ -94,16 +93,17 @@ class PopularPolicy(ScoringPolicy):
     vectors, it is the mean logged action. Only an exposure term is learned by gradient, and only by
     shares of steps.
 
-    With a half-life, a row that is h half-lives older than the last training row counts 2^−h.
+    Where recent rows count more, a row that is h half-lives older than the last training row counts
+    2^−h; rates have one half-life, shares of likes are a mixture of those of several.
     """
 
     scored_by: ClassVar[_Scored] = "steps"
-    half_life: Tensor
+    mixture: Tensor
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        if isinstance(config, RecentConfig):
-            self.register_buffer("half_life", torch.tensor(config.half_life or math.inf))
+        if self.chosen:
+            self.register_buffer("mixture", torch.tensor(HALF_LIVES_OF_DEMAND).isinf().double())
 
     def make_solver(
         self,
@@ -129,43 +129,56 @@ class PopularPolicy(ScoringPolicy):
 
     @torch.no_grad()
     def _set_scores(self, train: EpisodeStore, validation: EpisodeStore | None) -> None:
-        half_life = math.inf
-        if isinstance(self.config, RecentConfig):
-            if validation is not None and not self.config.half_life:
-                self.half_life.fill_(self.best_half_life(train, validation))
-            half_life = float(self.half_life)
-        counts = TrainingCounts.of(train, half_life=half_life)
-        self.head.get_parameter("bias").copy_(self.scores_of(counts))
+        if self.chosen and validation is not None:
+            self.mixture.copy_(self.choose_mixture(train, validation))
+        mixture = self.mixture if self.chosen else None
+        self.head.get_parameter("bias").copy_(self.scores_of(train, mixture))
 
     @classmethod
-    def scores_of(cls, counts: TrainingCounts) -> Tensor:
-        """Log-odds (n_items,) of the rate of likes, or logarithms of the shares of likes."""
+    def scores_of(
+        cls,
+        train: EpisodeStore,
+        mixture: Tensor | None = None,
+        liked_of: LikedOf = liked_rewards,
+    ) -> Tensor:
+        """Log-odds (n_items,) of the rate of likes, or logarithms of the shares of likes, with the
+        weights (H,) of the half-lives; None for all rows alike."""
+        if mixture is None:
+            return cls._score(TrainingCounts.of(train, liked_of))
+        weighted = zip(mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True)
+        parts = [
+            cls._score(TrainingCounts.of(train, liked_of, hours)).double() + math.log(weight)
+            for weight, hours in weighted
+            if weight
+        ]
+        return torch.stack(parts).logsumexp(0).float()
+
+    @classmethod
+    def _score(cls, counts: TrainingCounts) -> Tensor:
         if cls.scored_by == "rate":
             return torch.logit(shrink_rates(counts))
         likes = counts.liked.double() + _SMOOTHING / len(counts.liked)
-        return torch.log(likes / likes.sum()).float()
+        return torch.log(likes / likes.sum())
 
     @classmethod
-    def best_half_life(
+    def choose_mixture(
         cls,
         train: EpisodeStore,
         validation: EpisodeStore,
         liked_of: LikedOf = liked_rewards,
-    ) -> float:
-        """The half-life (hours) with the lowest loss on validation episodes; of equal ones, the
-        longest. The loss is the log loss of likes by rates, otherwise that of the liked items."""
-        held_out, losses = TrainingCounts.of(validation, liked_of), list[float]()
-        likes = held_out.liked.double()
-        for hours in HALF_LIVES:
-            scores = cls.scores_of(TrainingCounts.of(train, liked_of, hours))
-            if cls.scored_by == "rate":
-                rates = torch.sigmoid(scores.double())
-                nats = likes * rates.log() + (held_out.shown - likes) * torch.log1p(-rates)
-                losses.append(-float(nats.sum() / held_out.shown.sum()))
-            else:
-                losses.append(-float((likes * scores).sum() / likes.sum()))
-        finite = [loss if math.isfinite(loss) else math.inf for loss in losses]
-        return HALF_LIVES[len(losses) - 1 - int(np.argmin(finite[::-1]))]
+    ) -> Tensor:
+        """The weights (H,) of the half-lives with the lowest loss on validation episodes: that of
+        likes by rates, where one half-life has all weight, otherwise that of the liked items."""
+        counts = [TrainingCounts.of(train, liked_of, hours) for hours in HALF_LIVES_OF_DEMAND]
+        scores = torch.stack([cls._score(totals).double() for totals in counts])
+        held_out = TrainingCounts.of(validation, liked_of)
+        likes = torch.where(counts[-1].shown > 0, held_out.liked, 0).double()
+        if cls.scored_by == "likes":
+            return torch.from_numpy(fit_mixture(scores.exp().numpy(), likes.numpy()))
+        dislikes = held_out.shown - held_out.liked
+        terms = held_out.liked * F.logsigmoid(scores) + dislikes * F.logsigmoid(-scores)
+        best = len(scores) - 1 - int(terms.sum(1).flip(0).argmax())  # of equal ones, the longest
+        return F.one_hot(torch.tensor(best), len(scores)).double()
 
 
 class ItemRatePolicy(PopularPolicy):
@@ -175,25 +188,16 @@ class ItemRatePolicy(PopularPolicy):
     scored_by = "rate"
 
 
-@settings_table("policy")
-class RecentConfig(PolicyConfig):
-    """Settings of clicks and click rate with a half-life."""
-
-    half_life: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Hours after which a training row counts half; 0 chooses them on the validation rows."""
-
-
 class RecentRatePolicy(PopularPolicy):
     """`PopularPolicy` by the rate of likes, with the half-life that fits validation rows best."""
 
-    Config = RecentConfig
     items_only = "recent-rate"
-    chosen = ("half_life",)
+    chosen = ("mixture",)
     scored_by: ClassVar[_Scored] = "rate"
 
 
 class RecentClicksPolicy(RecentRatePolicy):
-    """`PopularPolicy` by shares of likes, with the half-life that fits validation rows best."""
+    """`PopularPolicy` by shares of likes, with the half-lives that fit validation rows best."""
 
     items_only = "recent-clicks"
     scored_by = "likes"

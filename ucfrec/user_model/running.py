@@ -140,19 +140,26 @@ class Demand:
             later = np.where(counts.any(0), held_out.item_counts(), 0.0)
         if later.any():
             last = np.stack([shares(hours)[-1] for hours in HALF_LIVES_OF_DEMAND])
-            weights = np.full((len(last), 1), 1 / len(last))
-            for _ in range(_ROUNDS):  # of expectation maximisation
-                parts = weights * last
-                steps = (parts / parts.sum(0) * later).sum(1, keepdims=True)
-                steps[-1] += _NO_DRIFT
-                weights = steps / steps.sum()
-            if weights[-1, 0] < _STEADY:
-                mixture = torch.from_numpy(weights[:, 0]).float()
+            weights = fit_mixture(last, later)
+            if weights[-1] < _STEADY:
+                mixture = torch.from_numpy(weights).float()
         if mixture[-1] == 1:
             return None
         weighted = zip(mixture.tolist(), HALF_LIVES_OF_DEMAND, strict=True)
         mixed = sum(weight * shares(hours) for weight, hours in weighted if weight)
         return Demand(bins, mixture, torch.from_numpy(np.log(mixed)).float())
+
+
+def fit_mixture(shares: Float64Array, later: Float64Array) -> Float64Array:
+    """The weights (H,) of shares (H, n_items) of items under which `later` counts (n_items,) are
+    likeliest, but for some held-out steps that speak for the last ones."""
+    weights = np.full((len(shares), 1), 1 / len(shares))
+    for _ in range(_ROUNDS):  # of expectation maximisation
+        parts = weights * shares
+        steps = (parts / parts.sum(0) * later).sum(1, keepdims=True)
+        steps[-1] += _NO_DRIFT
+        weights = steps / steps.sum()
+    return weights[:, 0]
 
 
 def _ages(times: Tensor, begin: Tensor) -> Tensor:

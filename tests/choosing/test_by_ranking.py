@@ -15,7 +15,12 @@ from tests.support.tagged import tagged_log, tagged_mapping, tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Query, Scorer, logged_scores
 from ucfrec.choosing import by_ranking
-from ucfrec.choosing.by_ranking import SHOWN, LoggedEvidence, _choose_best, choose_by_ranking
+from ucfrec.choosing.by_ranking import (
+    SHOWN,
+    LoggedEvidence,
+    LoggedOutcomes,
+    choose_by_ranking,
+)
 from ucfrec.choosing.by_simulation import RuleSearch, _batch_rules, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
@@ -83,7 +88,7 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
 def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(folder: Path) -> None:
     found, candidates = chosen(folder, 50.0, 0.0, 1000.0)
     ranked = [each for each in candidates if isinstance(each, RankedRule)]
-    overlaps = {each.rule.reward_weight: each.gain >= each.gain_error for each in ranked}
+    overlaps = {each.rule.reward_weight: each.overlaps for each in ranked}
     assert [*overlaps.items()][:2] == [(0.0, True), (1000.0, False)]
     assert overlaps[found.rule.reward_weight]
     assert not found.warning
@@ -114,21 +119,25 @@ def test_scores_in_memory_do_not_grow_with_the_catalogue(
 def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -> None:
     found, candidates = chosen(folder, -1e4, 0.0, 1.0)
     ranked = [each for each in candidates if isinstance(each, RankedRule)]
-    assert not any(each.gain >= each.gain_error for each in ranked)
+    assert not any(each.overlaps for each in ranked)
     most = max(ranked, key=lambda each: each.gain)
     enough = most.gain - most.gain_error
     assert found.rule in [each.rule for each in ranked if each.gain >= enough]
     assert "WARNING" in found.warning
 
 
-def test_of_rules_of_the_highest_rate_the_one_with_the_most_hits_is_chosen() -> None:
-    few, many, poor = (
-        RankedRule(DecisionRule(1.0, reward_weight=weight), rate, hits, hits, 0.1)
-        for weight, rate, hits in ((0.0, 0.5, 0.25), (1.0, 0.5, 0.5), (2.0, 0.1, 1.0))
-    )
-    rates = {rule: np.full(40, rule.item_rate) for rule in (few, many, poor)}
-    backwards = dict(reversed(rates.items()))
-    assert _choose_best(rates, np.arange(40)) is _choose_best(backwards, np.arange(40)) is many
+def test_of_rules_of_the_highest_value_the_one_with_the_most_hits_is_chosen() -> None:
+    few, many, poor, lossy = (DecisionRule(1.0, reward_weight=weight) for weight in range(4))
+    users, liked = np.arange(40), np.ones(40, dtype=bool)
+    hits = {few: users < 10, many: users < 20, poor: users < 40, lossy: users < 8}
+    values = {few: 0.5, many: 0.5, poor: 0.1, lossy: 0.9}
+    rows = {rule: np.full(40, value) for rule, value in values.items()}
+    outcomes = LoggedOutcomes(users, liked, users < 2, 0.9, hits, rows)
+    assert outcomes.choose().rule is many
+    assert [rule.overlaps for rule in outcomes.rank()] == [True, True, True, False]
+    assert outcomes._replace(keep_hits=0.5).choose().rule is lossy
+    backwards = {rule: hits[rule] for rule in reversed(hits)}
+    assert outcomes._replace(hits=backwards).choose().rule is many
 
 
 RULE = ["rule.sessions=20", "rule.least_items=2.0", "rule.least_impressions=1"]

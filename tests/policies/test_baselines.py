@@ -103,7 +103,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     return store_of(log, folder, reward="reward", session_by="user")
 
 
-@pytest.mark.parametrize("name", ["bpr", "gsasrec", "boosted"])
+@pytest.mark.parametrize("name", ["gsasrec", "boosted"])
 def test_peers_beat_popularity_where_users_differ(
     store: EpisodeStore, tmp_path: Path, name: str
 ) -> None:

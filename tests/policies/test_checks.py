@@ -17,7 +17,7 @@ from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy, policy_sizes
 
-ITEMS_ONLY = {"item-knn", "gsasrec", "bpr", "boosted", "item-rate", "recent-clicks", "recent-rate"}
+ITEMS_ONLY = {"item-knn", "gsasrec", "boosted", "item-rate", "recent-clicks", "recent-rate"}
 SMALL = {"policy.dim": 16, "policy.context": 6}
 
 

@@ -16,7 +16,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 KINDS, STEPS, SESSIONS = 4, 3, 400
 KNOWS_NOBODY = ("popular", "item-rate", "recent-clicks", "recent-rate")
-SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "bpr", "boosted")
+SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "boosted")
 ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:])
 SETTINGS = [
     *("train.steps=45", "train.validate_every=45", "train.learning_rate=0.01"),

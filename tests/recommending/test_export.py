@@ -181,7 +181,7 @@ def test_the_command_writes_it_whole_or_not_at_all(
 _SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("gsasrec", "recent-rate")]
 
 
-@pytest.mark.parametrize("name", ["bpr", *_SLOW])
+@pytest.mark.parametrize("name", ["sasrec", *_SLOW])
 def test_peers_are_exported(tmp_path: Path, name: str) -> None:
     trained = trained_run(tmp_path, name)
     written = export(trained, tmp_path / "out", k=5)

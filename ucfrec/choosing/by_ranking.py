@@ -1,13 +1,14 @@
 """What rules would have done at logged steps, and the choice of a reward weight by it.
 
 Where the log has no true sessions, a candidate is worth the mean rate, in the validation period, of
-the ten items that it would show, and overlaps with the log enough if it finds liked items better
-than the ten most liked ones do, by a standard error.
+the ten items that it would show, corrected by what users liked of these, and overlaps with the log
+enough if it finds liked items better than the ten most liked ones do, by a standard error.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleEvidence
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
+from ucfrec.policies.baselines import RecentClicksPolicy
 from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import (
@@ -141,78 +143,107 @@ class LoggedEvidence:
         return RuleEvidence(rate, likelihood, effective_users, spread, value, error)
 
 
+class LoggedOutcomes(NamedTuple):
+    """What rules do at M logged rows."""
+
+    users: IntArray
+    """(M,)."""
+    liked: BoolArray
+    """(M,)."""
+    baseline: BoolArray
+    """(M,) whether the item is one of ten that all users like."""
+    keep_hits: float
+    hits: dict[DecisionRule, BoolArray]
+    """(M,) whether the item is among the ten that a rule shows."""
+    values: dict[DecisionRule, Float64Array]
+    """(M,) whose mean is that of `RankedRule.value`."""
+
+    def rank(self) -> list[RankedRule]:
+        """The rules, in the order in which they were tried."""
+        n_liked, ranked = max(1, int(self.liked.sum())), list[RankedRule]()
+        without = min(self.hits, key=attrgetter("reward_weight"))
+        enough = self.keep_hits * (self.hits[without] & self.liked).sum()
+        for rule, hits in self.hits.items():
+            # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.
+            ahead = (hits.astype(np.float64) - self.baseline) * self.liked
+            gain, n_hits = float(ahead.sum()) / n_liked, int((hits & self.liked).sum())
+            error = _error_of_sum(ahead - gain * self.liked, self.users) / n_liked
+            overlaps = gain >= error and n_hits >= enough
+            value = float(self.values[rule].mean())
+            ranked.append(RankedRule(rule, value, n_hits / n_liked, gain, error, bool(overlaps)))
+        return ranked
+
+    def choose(self) -> RankedRule:
+        """The rule with the highest value, and of equal ones that with the most hits, of those that
+        overlap enough; without any, of those that hit about as often as the best one."""
+        ranked = self.rank()
+        allowed = [rule for rule in ranked if rule.overlaps]
+        if not allowed:
+            most = max(ranked, key=attrgetter("gain"))
+            allowed = [rule for rule in ranked if rule.gain >= most.gain - most.gain_error]
+        top, level = max(allowed, key=attrgetter("value")), list[RankedRule]()
+        for rule in allowed:
+            below = self.values[top.rule] - self.values[rule.rule]
+            if below.sum() <= _error_of_sum(below - below.mean(), self.users):
+                level.append(rule)
+        return max(level, key=attrgetter("hits"))
+
+
 def choose_by_ranking(problem: Problem) -> RuleChoice:
     """Choose the reward weight of the rule; its other parts stay.
 
-    Of those with enough overlap, or without any those whose hits cannot be told apart from the
-    most, the one with the highest rate is chosen, and of equal ones the one with the most hits. If
-    the next larger candidate overlaps too little, weights between the two are tried.
+    See `LoggedOutcomes.choose`. If the next larger candidate overlaps too little, weights between
+    the two are tried.
     """
     train, validation, scorer = problem.train, problem.validation, problem.scorer
     n_items = len(train.item_states.embeddings)
-    most = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS))
+    most, n_shown = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS)), min(SHOWN, n_items)
     episodes, steps = draw_steps(validation, most, problem.seed)
     logged = LoggedScores(scorer, validation, episodes, steps)
-    users, ranked = number_users(validation)[episodes], dict[RankedRule, Float64Array]()
-    most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, n_items)).indices.numpy()
-    baseline, n_liked = np.isin(logged.items, most_liked), max(1, int(logged.liked.sum()))
+    mixture = RecentClicksPolicy.choose_mixture(train, validation)
+    baselines = [
+        np.isin(logged.items, scores.topk(n_shown).indices.numpy()) & logged.liked
+        for scores in (RecentClicksPolicy.scores_of(train, m) for m in (None, mixture))
+    ]
     counts = TrainingCounts.of(validation)
     impressions, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
     rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
+    users = number_users(validation)[episodes]
+    baseline, keep_hits = max(baselines, key=np.sum), problem.config.keep_hits
+    outcomes = LoggedOutcomes(users, logged.liked, baseline, keep_hits, {}, {})
 
-    def rank(weights: Sequence[float]) -> RankedRule:
+    def try_weights(weights: Sequence[float]) -> RankedRule:
         rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
-        tops = np.zeros((len(rules), len(logged.steps), min(SHOWN, n_items)), dtype=np.int64)
+        tops = np.zeros((len(rules), len(logged.steps), n_shown), dtype=np.int64)
         for part, n, scores in logged.score(rules):
-            tops[n, part] = best_items(scores, tops.shape[2]).numpy()
+            tops[n, part] = best_items(scores, n_shown).numpy()
         for rule, top in zip(rules, tops, strict=True):
             hits = (top == logged.items[:, None]).any(1)
-            # 1 for a liked item that only the rule shows, −1 for one that only the baseline does.
-            ahead = (hits.astype(np.float64) - baseline) * logged.liked
-            gain, own_rates = float(ahead.sum()) / n_liked, rates[top].mean(1)
-            summary = RankedRule(
-                rule=rule,
-                item_rate=float(own_rates.mean()),
-                hits=float(hits[logged.liked].sum()) / n_liked,
-                gain=gain,
-                gain_error=_error_of_sum(ahead - gain * logged.liked, users) / n_liked,
+            liked_more = hits * (logged.liked - rates[logged.items])
+            outcomes.hits[rule] = hits
+            outcomes.values[rule] = rates[top].mean(1) + liked_more * len(hits) / (
+                hits.sum() + _PRIOR
             )
-            ranked[summary] = own_rates
-        return _choose_best(ranked, users)
+        return outcomes.choose()
 
-    best = rank(sorted({0.0, *problem.config.reward_weights}))
+    best = try_weights(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
-        by_weight = {candidate.rule.reward_weight: candidate for candidate in ranked}
+        by_weight = {candidate.rule.reward_weight: candidate for candidate in outcomes.rank()}
         nearest = min((larger for larger in by_weight if larger > weight), default=weight)
         if by_weight[nearest].overlaps:
             break
-        best = rank([(weight + nearest) / 2])
+        best = try_weights([(weight + nearest) / 2])
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
     chosen = RuleRecord(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
-        "liked items better than the ten most liked ones do, by a standard error; no propensities "
-        "are used",
-        tried=len(ranked),
+        "liked items better than the ten most liked ones do, of all time or lately, by a standard "
+        f"error, and {keep_hits:.0%} of those without the reward model; no propensities are used",
+        tried=len(outcomes.hits),
         warning="" if best.overlaps else warning,
     )
-    return chosen, [*ranked]
-
-
-def _choose_best(ranked: Mapping[RankedRule, Float64Array], users: IntArray) -> RankedRule:
-    """The rule to choose, of rules with the mean rate (M,) of the items that they show; if none
-    overlaps enough, of those that hit as often as any."""
-    allowed = [rule for rule in ranked if rule.overlaps]
-    if not allowed:
-        most = max(ranked, key=lambda rule: rule.gain)
-        allowed = [rule for rule in ranked if rule.gain >= most.gain - most.gain_error]
-    top, level = max(allowed, key=lambda rule: rule.item_rate), list[RankedRule]()
-    for rule in allowed:
-        below = ranked[top] - ranked[rule]
-        if below.sum() <= _error_of_sum(below - below.mean(), users):
-            level.append(rule)
-    return max(level, key=lambda rule: rule.hits)
+    return chosen, outcomes.rank()
 
 
 def _error_of_sum(values: Float64Array, users: IntArray) -> float:

@@ -54,6 +54,9 @@ class RuleConfig:
     tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)
     """Candidates for how often in a row one main tag may be liked, where the log shows that more
     causes fatigue."""
+    keep_hits: Share = 0.9
+    """Without true sessions: least share of the liked items found without the reward model that a
+    reward weight must leave."""
     sessions: Count = 100
     """Sessions simulated of each candidate; a quarter of them of those that are far behind then."""
     least_impressions: Count = 10
@@ -146,18 +149,18 @@ class RankedRule:
     """A rule and how it ranks validation rows."""
 
     rule: DecisionRule
-    item_rate: float
-    """Mean share of liked impressions, in the validation period, of the items shown."""
+    value: float
+    """Mean share of liked impressions, in the validation period, of the items shown, plus by how
+    much users like those of them that were logged more than others like these items."""
     hits: float
     """Share of liked validation rows whose item is among those shown."""
     gain: float
-    """Difference of `hits` from that of the most liked training items."""
+    """Difference of `hits` from that of the most liked items, or of those liked lately if these are
+    better."""
     gain_error: float
-
-    @property
-    def overlaps(self) -> bool:
-        """Whether it finds liked items better than these."""
-        return self.gain >= self.gain_error
+    overlaps: bool
+    """Whether it finds liked items better than these, and `rule.keep_hits` of the hits that it has
+    without the reward model."""
 
 
 class RuleRecord(Entry):

@@ -89,10 +89,10 @@ class SequencePolicy(nn.Module, ABC):
     """Buffers that `make_solver` chooses on held-out episodes; a refit keeps them."""
     items_only: ClassVar[str] = ""
     """Name of a policy that recommends items and refuses vectors; empty for others."""
-    counts_steps_alike: ClassVar[bool] = False
-    """Whether all steps are in about as many windows; otherwise the ends of these are uniform."""
-    refits_fully: ClassVar[bool] = False
-    """Whether a refit takes as many steps as the training did, not a share of the best weights'."""
+    literal: ClassVar[bool] = False
+    """Whether items are learned as vectors are: windows end at any step alike, so that the last
+    steps of a session are in few of them, and embeddings of places begin as large as those of
+    items."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
@@ -135,6 +135,16 @@ class SequencePolicy(nn.Module, ABC):
         count = int(np.ceil(config.best_share * train.n_episodes))
         best = np.argsort(-train.returns, kind="stable")[:count]
         return train.select(np.sort(best))
+
+    def begin_with_items(self) -> None:
+        """Let items say more than their places at the begin of a training: embeddings of places
+        are small, and products with item vectors are not divided by √d, so that these learn as fast
+        as the rest."""
+        for name, module in self.named_modules():
+            if name.endswith(("embed_timestep", "embed_position")):
+                draw_normal(module.weight, std=0.02)
+            elif name == "final_norm":
+                nn.init.constant_(module.weight, self.config.dim**0.5)
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set buffers from the training episodes, before the first update."""

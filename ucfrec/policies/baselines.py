@@ -16,7 +16,7 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown, Windows
-from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, draw_normal, embedding
+from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
@@ -311,85 +311,6 @@ class ItemKNNPolicy(ScoringPolicy):
         return self.temperature * scores + self.head.get_parameter("bias")
 
 
-class LikedPolicy(ScoringPolicy):
-    """Learns from which items were liked: from rewards of at least `least_liked`."""
-
-    reward_low: Tensor
-    reward_high: Tensor
-
-    def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
-        super().__init__(config, sizes)
-        for name in ("reward_low", "reward_high"):
-            self.register_buffer(name, torch.zeros(()))
-
-    def start_from(self, train: EpisodeStore) -> None:
-        """Set the range of the rewards, by which a step counts as liked."""
-        rewards = train.column(schema.REWARD)
-        self.reward_low.fill_(float(rewards.min()))
-        self.reward_high.fill_(float(rewards.max()))
-
-    def find_liked(self, windows: Windows) -> Tensor:
-        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
-        least = least_liked(self.reward_low, self.reward_high)
-        return ((windows.rewards >= least) & windows.mask).float()
-
-
-@settings_table("policy")
-class BPRConfig(PolicyConfig):
-    """Settings of BPR; `dim` is the number of factors, `context` − 1 the items that make a user."""
-
-
-class BPRPolicy(LikedPolicy):
-    """Scores items by the product of their factors with the user's, plus a bias per item.
-
-    A user's factors are the mean of factors of the items that the session liked before, as in FISM
-    (Kabbur et al., 2013), so that users who are new have some as well. The loss is
-    −log σ(s(i) − s(j)) of a liked item i and a uniformly drawn item j. States and returns are not
-    used.
-    """
-
-    Config = BPRConfig
-    config: BPRConfig
-    items_only = "bpr"
-
-    def __init__(self, config: BPRConfig, sizes: Mapping[str, int]) -> None:
-        super().__init__(config, sizes)
-        self.of_history = embedding(sizes["items"], config.dim)
-        draw_normal(self.of_history.weight, std=0.1)
-
-    def features(self, windows: Windows) -> Tensor:
-        """Factors (B, K, d) of the user before each step."""
-        liked = self.find_liked(windows).unsqueeze(-1)
-        sums = (self.of_history(windows.actions) * liked).cumsum(1)
-        means = sums / liked.cumsum(1).clamp(min=1)
-        return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
-
-    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean loss over the liked steps of the windows, and scalars to log."""
-        head = self.head
-        assert isinstance(head, ItemHead)
-        normalized, liked = self.normalize(windows), self.find_liked(windows) > 0
-        features, items = self.features(normalized)[liked], windows.actions[liked]
-        exposed = self.exposed(normalized, liked)
-        negative = torch.randint(len(head.bias), items.shape, device=items.device)
-        apart = head.logit(features, items, exposed) - head.logit(features, negative, exposed)
-        value = -F.logsigmoid(apart).sum() / max(1, len(items))
-        return value, {"bpr_loss": value.detach()}
-
-    def action_loss(self, windows: Windows) -> Tensor:
-        """Mean loss over the liked last steps and all items, the validation loss."""
-        liked = self.find_liked(windows)[:, -1] > 0
-        if not bool(liked.any()):
-            return windows.rewards.new_zeros(())
-        rows = torch.nonzero(liked)[:, 0]
-        losses = []
-        for part in torch.split(rows, max(1, _AT_ONCE // len(self.of_history.weight))):
-            scores = self.act(windows.at(part))
-            items = windows.actions[part, -1:]
-            losses.append(-F.logsigmoid(scores.gather(1, items) - scores).mean(1))
-        return torch.cat(losses).mean()
-
-
 @settings_table("policy")
 class BoostedConfig(PolicyConfig):
     """Settings of the boosted click model; `context` − 1 is the number of items of history."""
@@ -398,7 +319,7 @@ class BoostedConfig(PolicyConfig):
     """Items that the trees score, those with the highest rates; others have the item's rate."""
 
 
-class BoostedPolicy(LikedPolicy):
+class BoostedPolicy(ScoringPolicy):
     """Scores items by the log-odds of a like, predicted by gradient-boosted trees.
 
     The trees (scikit-learn's histogram boosting) see the columns of `_inputs`: rates, counts, and
@@ -410,6 +331,8 @@ class BoostedPolicy(LikedPolicy):
     Config = BoostedConfig
     config: BoostedConfig
     items_only = "boosted"
+    reward_low: Tensor
+    reward_high: Tensor
     impressions: Tensor
     liked: Tensor
     directions: Tensor
@@ -423,6 +346,8 @@ class BoostedPolicy(LikedPolicy):
         super().__init__(config, sizes)
         n_items, splits = sizes["items"], (_SPLITS, TREES)
         for name, value in (
+            ("reward_low", torch.zeros(())),
+            ("reward_high", torch.zeros(())),
             ("impressions", torch.zeros(n_items)),
             ("liked", torch.zeros(n_items)),
             ("directions", torch.zeros(n_items, sizes["action"])),
@@ -436,8 +361,10 @@ class BoostedPolicy(LikedPolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set counts, directions and first tags of the items, and the range of the rewards."""
-        super().start_from(train)
         counts, states = TrainingCounts.of(train), train.item_states
+        rewards = train.column(schema.REWARD)
+        self.reward_low.fill_(float(rewards.min()))
+        self.reward_high.fill_(float(rewards.max()))
         self.impressions.copy_(counts.shown)
         self.liked.copy_(counts.liked)
         self.directions.copy_(F.normalize(states.embeddings, dim=1))
@@ -484,6 +411,11 @@ class BoostedPolicy(LikedPolicy):
             target.append(liked_rewards(train, rewards))
         return np.concatenate(inputs), np.concatenate(target)
 
+    def _find_liked(self, windows: Windows) -> Tensor:
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
+        least = least_liked(self.reward_low, self.reward_high)
+        return ((windows.rewards >= least) & windows.mask).float()
+
     def _rate(self, liked: Tensor, impressions: Tensor) -> Tensor:
         """Log-odds of rates of likes, shrunk to the mean by `PRIOR` rows."""
         mean = (self.liked.sum() + 0.5) / (self.impressions.sum() + 1)
@@ -500,7 +432,7 @@ class BoostedPolicy(LikedPolicy):
         rows."""
         valid = windows.mask[:, :-1].float()  # (B, N)
         earlier = windows.actions[:, :-1]
-        liked = self.find_liked(windows)[:, :-1]
+        liked = self._find_liked(windows)[:, :-1]
         if counts is None:
             counts = torch.stack([self.impressions[items], self.liked[items]])
         shown_of, liked_of = counts
@@ -550,7 +482,7 @@ class BoostedPolicy(LikedPolicy):
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean log loss (nats) of likes at the windows' last steps."""
         scores = self._score(windows, windows.actions[:, -1:])[:, 0]
-        return F.binary_cross_entropy_with_logits(scores, self.find_liked(windows)[:, -1])
+        return F.binary_cross_entropy_with_logits(scores, self._find_liked(windows)[:, -1])
 
 
 def _round(values: Tensor) -> Tensor:

@@ -34,7 +34,6 @@ BUILT_IN = {
     "item-rate": "baselines:ItemRatePolicy",
     "recent-clicks": "baselines:RecentClicksPolicy",
     "recent-rate": "baselines:RecentRatePolicy",
-    "bpr": "baselines:BPRPolicy",
     "boosted": "baselines:BoostedPolicy",
     "item-knn": "baselines:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",

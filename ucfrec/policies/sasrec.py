@@ -3,7 +3,7 @@ gSASRec (Petrov & Macdonald, 2023), with many negatives and a generalised BCE lo
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import Layers, SequencePolicy, draw_normal, embedding
+from ucfrec.policies.base import Layers, SequencePolicy, embedding
 from ucfrec.policies.dt import Block, DTConfig, pass_rows
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.ucf import Dropout, visible_tokens
@@ -33,22 +33,10 @@ class SASRecPolicy(SequencePolicy):
 
     Config = SASRecConfig
     config: SASRecConfig
-    counts_steps_alike = True
-    refits_fully = True
-    presets: ClassVar[Mapping[str, Any]] = {
-        "train.learning_rate": 1e-3,
-        "train.steps": 3000,
-        "train.warmup_steps": 50,
-        "train.validate_every": 100,
-        "train.patience": 10,
-    }
 
     def __init__(self, config: SASRecConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         self.embed_position = embedding(config.context, config.dim)
-        draw_normal(self.embed_position.weight, std=0.02)  # items say more than their places
-        if isinstance(self.head, ItemHead):
-            draw_normal(self.head.correction, std=0.02)
         self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
@@ -71,8 +59,7 @@ class SASRecPolicy(SequencePolicy):
         positions = self.embed_position.weight[-windows.mask.shape[1] :]
         tokens = self.dropout(tokens + positions)
         features = pass_rows(self.blocks, tokens, visible_tokens(windows.mask), rows)
-        # As in the paper, products are not divided by √d: item vectors learn as fast as the rest.
-        return self.final_norm(features) * self.config.dim**0.5  # type: ignore[no-any-return]
+        return self.final_norm(features)  # type: ignore[no-any-return]
 
 
 @settings_table("policy")

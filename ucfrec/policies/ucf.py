@@ -175,7 +175,12 @@ class UCFPaperPolicy(UCFPolicy):
 
     Config = UCFPaperConfig
     augmented = True
+    literal = True
     presets: ClassVar[Mapping[str, Any]] = {
+        "train.learning_rate": 1e-4,
+        "train.warmup_steps": 500,
+        "train.validate_every": 500,
+        "train.patience": 0,
         "crm.mean_first": False,
         "crm.learning_rate": 3e-4,
         "crm.epochs": 40,

@@ -90,7 +90,7 @@ def fit_policy(
     newest = np.array([], dtype=np.int64) if newest is None else newest
     recent = train.select(newest)
     training = train if augmented is None else TrainingEpisodes(train, augmented)
-    reach = k if policy.counts_steps_alike else 1
+    reach = k if isinstance(policy.head, ItemHead) and not policy.literal else 1
 
     def draw(generator: np.random.Generator) -> Windows:
         episodes, steps = training.draw_steps(generator, size, reach)

@@ -8,7 +8,6 @@ from typing import Any
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
-from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
@@ -16,19 +15,15 @@ from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 from ucfrec.user_model.session_end import SESSIONS
 
-SHARE = 0.25
-"""Steps of a refit, as a share of those that the best weights took."""
-
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     """Go on training the policy of the finished run `first`, on all episodes of its store.
 
     Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
     model's effects and the decision rule are those of `first`. The best weights are trained for
-    `SHARE` of the steps that they took, or as many as the training had if the policy
-    `refits_fully`, while the learning rate falls to 0; policies that are fitted without gradients
-    are fitted again. Item embeddings stay those of the store's training split. There is nothing
-    left to evaluate the policy on but later logs.
+    as many steps as the training had, while the learning rate falls to 0; policies that are fitted
+    without gradients are fitted again. Item embeddings stay those of the store's training split.
+    There is nothing left to evaluate the policy on but later logs.
 
     Args:
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
@@ -53,9 +48,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     if chosen.dropped_observations:
         store = store.without_observation_dimensions(chosen.dropped_observations)
     config = chosen.config
-    steps = max(1, round(SHARE * chosen.finished.best_step))
-    if policy_class(config.policy_name).refits_fully:
-        steps = chosen.finished.steps
+    steps = chosen.finished.steps
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))

@@ -34,7 +34,6 @@ def _extend(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
 
 PEERS: Final[Mapping[str, Method]] = {
     "gsasrec": Method("gsasrec", conditioned=False),
-    "bpr": Method("bpr", conditioned=False),
 }
 """Strong methods of practice that are trained by gradients; items only."""
 PAPER: Final[Mapping[str, Method]] = {

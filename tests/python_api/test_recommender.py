@@ -219,7 +219,6 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (log, {"session_by": "user", "gap_minutes": 3}, "gap_minutes is 3, but sessions are those"),
         (log.assign(session_id=1), {"gap_minutes": 3}, "session_by='session_id'; leave it out"),
         (log, {"dataset": "movielens"}, "dataset is 'movielens', but only files have one"),
-        (log.assign(reward=1.0), {}, "nothing to learn"),
     ):
         with pytest.raises(InputError, match=message):
             policy.fit(data, **options)  # type: ignore[arg-type]
@@ -227,6 +226,18 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
     for use in (lambda: policy.run, lambda: policy.recommend(log), lambda: policy.trained):
         with pytest.raises(InputError, match="not trained yet"):
             use()
+
+
+def test_equal_rewards_are_learned_as_a_ranking(log: pd.DataFrame, tmp_path: Path) -> None:
+    policy = Recommender("sasrec", settings=SMALL)
+    with pytest.warns(InputNote, match="all .* rewards equal 1: policies learn what users choose"):
+        policy.fit(log.assign(reward=1.0), tmp_path / "run", refit=False)
+    record = policy.trained.record
+    assert record.rule is None
+    assert record.ranking is not None
+    assert 0 < record.ranking.ndcg < record.ranking.hits < 1
+    assert "NDCG@10" in record.describe()
+    assert policy.recommend(log.assign(reward=1.0), k=2).groupby("user_id").size().eq(2).all()
 
 
 def test_a_policy_saved_and_loaded(fitted: Recommender, log: pd.DataFrame, tmp_path: Path) -> None:

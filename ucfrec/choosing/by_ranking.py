@@ -17,8 +17,15 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleEvidence, RuleRecord
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.choosing.choice import (
+    Problem,
+    RankedRule,
+    RankingReport,
+    RuleChoice,
+    RuleEvidence,
+    RuleRecord,
+)
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
@@ -244,6 +251,37 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         warning="" if best.overlaps else warning,
     )
     return chosen, outcomes.rank()
+
+
+def measure_ranking(
+    scorer: Scorer, train: EpisodeStore, validation: EpisodeStore, seed: int
+) -> RankingReport:
+    """How the policy ranks validation rows, beside the items that are shown most of late."""
+
+    def shown(view: EpisodeStore, rewards: Array) -> BoolArray:
+        return np.ones(len(rewards), dtype=bool)
+
+    episodes, steps = draw_steps(validation, _FEWEST_STEPS, seed)
+    logged = LoggedScores(scorer, validation, episodes, steps)
+    mixture = RecentClicksPolicy.choose_mixture(train, validation, shown)
+    demand = RecentClicksPolicy.scores_of(train, mixture, shown)
+    gains = np.zeros((2, len(steps)))
+    for part, _, scores in logged.score([replace(scorer.rule, exclude_seen=True)]):
+        items = torch.from_numpy(logged.items[part]).unsqueeze(1)
+        baseline = demand.masked_fill(scores.isneginf(), -torch.inf)
+        for number, values in enumerate((scores, baseline)):
+            logged_score = values.gather(1, items)
+            places = (values > logged_score).sum(1) + 1
+            is_hit = (places <= SHOWN) & ~logged_score.isneginf()[:, 0]
+            gains[number, part] = (is_hit / torch.log2(places + 1.0)).numpy()
+    hits, ndcg = (gains > 0).mean(1), gains.mean(1)
+    return RankingReport(
+        rows=len(steps),
+        hits=float(hits[0]),
+        ndcg=float(ndcg[0]),
+        baseline_hits=float(hits[1]),
+        baseline_ndcg=float(ndcg[1]),
+    )
 
 
 def _error_of_sum(values: Float64Array, users: IntArray) -> float:

@@ -179,5 +179,18 @@ class RuleRecord(Entry):
     session_end: SessionEndReport | None = None
 
 
+class RankingReport(Entry):
+    """How a policy without a chosen rule ranks validation rows."""
+
+    rows: record.Count
+    hits: float
+    """Share of the rows whose item is among the ten best that the user has not been shown."""
+    ndcg: float
+    """Mean of 1 / log2(place + 1) of these, 0 for others."""
+    baseline_hits: float
+    """The same of the items shown most, lately where these are better at it."""
+    baseline_ndcg: float
+
+
 RuleChoice = tuple[RuleRecord, Sequence[SimulatedRule | RankedRule]]
 """The rule that was chosen, and all candidates."""

@@ -53,6 +53,9 @@ class Train(TrainingOptions):
     no_refit: bool = False
     """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
     `ope` on the test split use the weights before that)"""
+    goal: Literal["rank", "reward"] | None = None
+    """What recommendations are for: to `rank` what users choose next, as --set rule.choose=false,
+    or to bring the most `reward`, by a decision rule (default: reward, where rewards vary)"""
     evidence: int | None = None
     """Effective users that the decision rule must leave in the validation sessions; where the log
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""
@@ -76,13 +79,17 @@ class Train(TrainingOptions):
                 wait()  # until the leader has begun the run
             store = EpisodeStore.open(self.store)
             if self.refit is None:
-                evidence = [] if self.evidence is None else [f"rule.evidence={self.evidence}"]
-                settings = [*self.set, *evidence]
+                settings = [*self.set]
+                if self.goal is not None:
+                    settings.append(f"rule.choose={json.dumps(self.goal == 'reward')}")
+                if self.evidence is not None:
+                    settings.append(f"rule.evidence={self.evidence}")
                 config = resolve_config(self.policy, self.config, settings, self.seed)
                 record = train_policy(store, self.out, config, not self.no_refit)
-            elif self.config or self.set or self.evidence is not None:
+            elif self.config or self.set or self.goal or self.evidence is not None:
                 raise InputError(
-                    "--refit takes all settings of the run; omit --config, --set and --evidence"
+                    "--refit takes all settings of the run; omit --config, --set, --goal and "
+                    "--evidence"
                 )
             else:
                 record = refit(store, self.refit, self.out)
@@ -102,7 +109,9 @@ class Train(TrainingOptions):
             print(f"refit         {whole.train_steps:,} rows, all of the store")
         run = quote(str(self.out))
         print(f"\nrun: {self.out} (TensorBoard can open it)\nmodel card: {self.out / CARD}")
-        if record.rule is None:
+        if record.ranking is not None:
+            print(f"next: ucfrec rank {run}, on the test split of the store")
+        elif record.rule is None:
             print(f"next: ucfrec evaluate {run} --env NAME, in a simulator of these actions")
         else:
             held_out = ", its value on the test split of the store"

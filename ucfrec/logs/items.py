@@ -15,7 +15,6 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import DISTINCT_TAGS, ITEM_STATES, write_item_table
 from ucfrec.episodes.record import StoreRecord
-from ucfrec.errors import InputError
 from ucfrec.logs.features import EncodedFeatures
 from ucfrec.logs.rows import keep_users_whole
 from ucfrec.logs.sessions import Moments
@@ -72,7 +71,7 @@ def write_item_states(
     size: int,
 ) -> None:
     """Learn the item embeddings (at most `size` dimensions) and user features of the store at
-    `folder` and write them there. Raises InputError if all rewards of the training split are equal.
+    `folder` and write them there. Where all rewards of the training split are equal, all are high.
     """
     shards = range(StoreRecord.read(folder).n_shards)
     moments, low, highest = Moments(1), np.inf, -np.inf
@@ -82,10 +81,7 @@ def write_item_states(
         low = min(low, float(rewards.min(initial=np.inf)))
         highest = max(highest, float(rewards.max(initial=-np.inf)))
     high = min(highest, float(moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])))
-    if not low < high:
-        raise InputError(
-            f"all {moments.count} rewards of the training split equal {low}; choose another reward"
-        )
+    low = low if low < high else high - 1
     matrix = Exposure(scratch / "exposure.bin", encoded.item_counts)
     for batch in keep_users_whole(read_training_steps(folder, shards), schema.USER):
         liking = np.clip((batch[schema.REWARD] - low) / (high - low), 0, 1)

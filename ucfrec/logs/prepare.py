@@ -261,7 +261,7 @@ def read_log(
                 summary.require_rows(log, rows.count, rows.dropped, store if grows else None)
                 summary.note_losses(rows, reward, mapping.where)
                 if store is None:
-                    summary.require_variety(rows)
+                    summary.note_constant(rows)
                 stage.update()
                 split = (1.0, 0.0, 0.0) if evaluates else options.split
                 cut = sessions.Cut(

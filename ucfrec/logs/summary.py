@@ -267,12 +267,13 @@ def require_rows(
     )
 
 
-def require_variety(rows: SortedRows) -> None:
-    """Raise InputError if all usable rows have the same reward."""
+def note_constant(rows: SortedRows) -> None:
+    """Warn if all usable rows have the same reward."""
     if rows.lowest == rows.highest:
-        raise InputError(
-            f"{rows.log.name}: all {rows.count} rewards equal {rows.lowest:g}, so there is "
-            "nothing to learn; choose another reward expression"
+        warn_user(
+            f"{rows.log.name}: all {rows.count:,} rewards equal {rows.lowest:g}: policies learn "
+            "what users choose next, not what rewards them; for that, choose another reward "
+            "expression"
         )
 
 

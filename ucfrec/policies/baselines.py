@@ -253,9 +253,12 @@ class ItemKNNPolicy(ScoringPolicy):
         episodes, steps = train.all_steps()
         items = train.step_values(schema.ITEM, episodes, steps)
         rewards = train.step_values(schema.REWARD, episodes, steps)
-        self.reward_low.fill_(float(rewards.min()))
+        low = float(rewards.min())
+        self.reward_low.fill_(low if low < rewards.max() else low - 1)
         shape = (train.n_episodes, len(self.cosines))
-        liked = sparse.csr_matrix((rewards - rewards.min(), (episodes, items)), shape=shape)
+        liked = sparse.csr_matrix(
+            (rewards - float(self.reward_low), (episodes, items)), shape=shape
+        )
         lengths = np.sqrt(np.asarray(liked.multiply(liked).sum(axis=0))).ravel()
         columns = (liked @ sparse.diags(1 / np.where(lengths > 0, lengths, 1.0))).tocsc()
         at_once = max(1, min(_ROWS, _AT_ONCE // shape[1]))

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import RuleEvidence, RuleRecord
+from ucfrec.choosing.choice import RankingReport, RuleEvidence, RuleRecord
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
@@ -185,6 +185,8 @@ class RunRecord(TrainingRecord):
     policy: Fit | None = None
     reward_model: ItemRewardReport | None = None
     rule: RuleRecord | None = None
+    ranking: RankingReport | None = None
+    """Of a policy of items whose rule was not chosen."""
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
@@ -272,6 +274,12 @@ class RunRecord(TrainingRecord):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
             lines += _describe_rule(self.rule, self.reward_model, self.mean_return)
+        if (ranking := self.ranking) is not None and self.rule is None:
+            lines.append(
+                f"ranking       NDCG@10 {ranking.ndcg:.3f}, hit rate {ranking.hits:.3f} at "
+                f"{ranking.rows:,} validation rows; items shown most lately have "
+                f"{ranking.baseline_ndcg:.3f}, {ranking.baseline_hits:.3f}"
+            )
         return "\n".join(lines)
 
 

@@ -16,7 +16,7 @@ import torch
 from ucfrec import __version__, schema
 from ucfrec.acting.decision import best_items
 from ucfrec.acting.scorer import Scorer, logged_scores
-from ucfrec.choosing.by_ranking import choose_by_ranking
+from ucfrec.choosing.by_ranking import choose_by_ranking, measure_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem, RuleRecord
 from ucfrec.counterfactual.augmentation import MODELS, AugmentationReport, augment_episodes
@@ -192,7 +192,13 @@ def train_run(
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.copy_with(augmentation=augmentation, policy=fit)
         if run.logged.has_items:
-            if config.rule.choose and not chosen:
+            rewards = run.logged.column(schema.REWARD)
+            if not config.rule.choose or rewards.min() == rewards.max():
+                if refit_of is None and record.ranking is None:
+                    scorer = TrainedPolicy.load(out, in_training=True).scorer()
+                    ranking = measure_ranking(scorer, run.logged, run.held_out, config.seed)
+                    record = record.copy_with(ranking=ranking)
+            elif not chosen:
                 with phase("Fitting the user model", 3, 4):
                     users = _fit_user_model(run, initial)
                 with phase("Selecting the decision rule", 4, 4):

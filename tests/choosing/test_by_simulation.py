@@ -182,14 +182,6 @@ def test_rules_far_behind_are_not_simulated_in_all_sessions(trained: TrainedPoli
     assert {len(each.returns) for each in unsupported._sessions.values()} == {120}
 
 
-def test_halves_of_the_users_say_if_they_would_choose_another_rule(trained: TrainedPolicy) -> None:
-    search = search_of(trained, replace(FEW, sessions=39))
-    plain, weighted = search.simulate([drawn(0.0), drawn(4.0)])
-    assert weighted.value > plain.value + 2 * plain.error
-    assert search.halves_agree(weighted, [plain, weighted]) == (True, True)
-    assert not any(search.halves_agree(plain, [plain, weighted]))
-
-
 def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPolicy) -> None:
     targets = (trained.target_return(quantile) for quantile in FEW.quantiles)
     store, scorer = EpisodeStore.open(folder / "store"), trained.scorer(DecisionRule(2.0))

@@ -18,11 +18,9 @@ from ucfrec.policies.convformers import LSDTConfig, LSDTPolicy
 from ucfrec.policies.dt import attend
 from ucfrec.policies.registry import policy_class
 from ucfrec.policies.ucf import (
-    _FEW,
     EPSILON,
     CausalDepthwise,
     Dropout,
-    StackedStreams,
     UCFConfig,
     UCFPolicy,
     draw_mask,
@@ -212,29 +210,15 @@ def test_parameters_are_the_official_ones_less_the_unused(
 
 @both_heads
 @pytest.mark.parametrize(("padding", "cropped"), [((0, 2, 5), 0), ((5, 4, 3), 3)])
-def test_stacked_streams_are_the_streams(
+def test_padding_that_all_windows_share_can_be_left_out(
     sizes: dict[str, int], padding: tuple[int, ...], cropped: int
 ) -> None:
     policy = build("ucf", sizes)
     windows = policy.normalize(random_windows(sizes, padding))
     with torch.no_grad():
         expected = policy.last_features(windows)
-        many = Windows.joined([windows] * _FEW)
-        assert torch.equal(policy.acting_features()(many), policy.last_features(many))
-        # Padding that all windows share can be excluded.
-        found = policy.acting_features()(windows.last(K - cropped))
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_a_learner_with_its_own_last_step_keeps_it() -> None:
-    class Own(UCFPolicy):
-        def last_features(self, windows: Windows) -> torch.Tensor:
-            return super().last_features(windows) + 1
-
-    policy = build("ucf", CATALOG)
-    assert isinstance(policy.acting_features(), StackedStreams)
-    policy.__class__ = Own
-    assert not isinstance(policy.acting_features(), StackedStreams)
+        found = policy.last_features(windows.last(K - cropped))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 masks = st.integers(1, 6).flatmap(

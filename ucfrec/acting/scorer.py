@@ -433,10 +433,6 @@ class _ItemProduct:
         return len(self._states.embeddings)
 
     @cached_property
-    def _features(self) -> Callable[[Windows], Tensor]:
-        return self._policy.acting_features()
-
-    @cached_property
     def _matrix(self) -> tuple[Tensor, Tensor, tuple[int, int]]:
         """The matrix (d, n_items), the policy's bias (n_items,), and how many of the first rows
         are the policy's, and those or of likeness."""
@@ -490,7 +486,7 @@ class _ItemProduct:
         """The policy's features (B, d) and its part, from windows with their target returns."""
         device = self._policy.state_mean.device
         normalized = self._policy.normalize(windows.to(device))
-        features = self._features(normalized)
+        features = self._policy.last_features(normalized)
         repeated = alike = features.new_zeros(features.shape[0], self._columns)
         if self._exposure is not None:
             items, rewards = (values.to(device) for values in recent.padded(self.lags))

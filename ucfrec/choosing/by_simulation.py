@@ -368,26 +368,6 @@ class RuleSearch:
 
         return min([*complete, *self._add_evidence(unknown)], key=rank)
 
-    def halves_agree(
-        self, chosen: SimulatedRule, candidates: Sequence[SimulatedRule]
-    ) -> tuple[bool, bool]:
-        """Whether the chosen rule is level with the best allowed one in either half of users."""
-        own_returns = self._sessions[chosen.rule].returns
-        n = len(own_returns)
-        half = number_users(self._store)[np.arange(n) % len(self._store)] % 2
-        allowed = {item.rule for item in candidates if self.is_allowed(item)} | {chosen.rule}
-        returns = [self._sessions[rule].returns[:n] for rule in allowed]
-
-        def agrees(rows: Any) -> bool:
-            top = max((values[rows] for values in returns if len(values) == n), key=np.sum)
-            if len(top) < _FEWEST:
-                return True
-            mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
-            margin = max(error, self._config.tolerance * abs(mean))
-            return bool(own_returns[rows].mean() >= mean - margin)
-
-        return agrees(half == 0), agrees(half == 1)
-
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it; those of either
         half of the users are corrected by logged steps of that half."""
@@ -475,14 +455,13 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         finalists = search.finalists(candidates, search.best(candidates))
         candidates = [*{item.rule: item for item in [*candidates, *finalists]}.values()]
     best = search.most_evident(finalists)
-    agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
+    estimate = search.estimate(best.rule)
     chosen = RuleRecord(
         rule=best.rule,
         chosen_by=f"mean return of simulated sessions{where}",
         warning=_warning(search, best, estimate),
         tried=len(candidates),
         estimate=estimate,
-        halves_agree=agree,
         session_end=search.users.session_end_report,
     )
     return chosen, [best if item.rule == best.rule else item for item in candidates]

@@ -174,8 +174,6 @@ class RuleRecord(Entry):
     """Number of candidates."""
     estimate: ValueEstimate | None = None
     """Its value; None for a rule that was not simulated."""
-    halves_agree: tuple[bool, bool] | None = None
-    """Whether the sessions of either half of the users would choose the rule, too."""
     session_end: SessionEndReport | None = None
 
 

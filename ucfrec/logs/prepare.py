@@ -64,8 +64,9 @@ class PrepareOptions:
     max_session: Count | None = None
     """Episodes with more steps are dropped, as of bots; None for none."""
     split: tuple[float, ...] = (0.8, 0.1, 0.1)
-    """Shares of the rows for train, validation and test in order of time, or the two times (ms) at
-    which validation and test begin."""
+    """Shares of the rows for train, validation and test in order of time; the two times (ms) at
+    which validation and test begin; or the number of last rows of every user that test, and as many
+    before them validate."""
     embedding_size: Width = 32
     """Most dimensions of an item embedding."""
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"
@@ -93,26 +94,32 @@ class PrepareOptions:
         )
         times = len(self.split) == 2 and self.split[0] <= self.split[1]
         shares = len(self.split) == 3 and min(self.split) >= 0 and self.split[0] > 0
+        last = len(self.split) == 1 and self.split[0] >= 1
         require(
-            times or (shares and math.isclose(sum(self.split), 1, abs_tol=1e-9)),
-            f"split is {self.split}: give three shares that add up to 1, the first above 0, or "
-            "two times in order",
+            last or times or (shares and math.isclose(sum(self.split), 1, abs_tol=1e-9)),
+            f"split is {self.split}: give three shares that add up to 1, the first above 0, "
+            "two times in order, or a number of last rows",
             "split",
         )
 
 
 def parse_split(text: str) -> tuple[float, ...]:
-    """Read `PrepareOptions.split`: "0.8,0.1,0.1", or two times "2022-04-28,2022-04-29T12:00" (UTC
-    by default). Raises InputError if it is neither."""
-    parts = text.split(",")
+    """Read `PrepareOptions.split`: "0.8,0.1,0.1", two times "2022-04-28,2022-04-29T12:00" (UTC by
+    default), "leave-last-out" or "leave-last-5". Raises InputError if it is none of these."""
+    parts, last = text.split(","), text.removeprefix("leave-last-")
     try:
+        if last != text:
+            return (1.0 if last == "out" else float(int(last)),)
         if len(parts) == 3:
             return tuple(float(part) for part in parts)
         times = [datetime.fromisoformat(part.strip()) for part in parts]
     except ValueError:
         times = []
     if len(times) != 2:
-        raise InputError(f"split {text!r}: write shares as 0.8,0.1,0.1 or two times in ISO format")
+        raise InputError(
+            f"split {text!r}: write shares as 0.8,0.1,0.1, two times in ISO format, or "
+            "leave-last-out or leave-last-5"
+        )
     return tuple(t.replace(tzinfo=t.tzinfo or UTC).timestamp() * 1000 for t in times)
 
 
@@ -270,6 +277,7 @@ def read_log(
                     options.min_steps,
                     sessions.split_bounds(rows, split),
                     options.max_session,
+                    int(split[0]) if len(split) == 1 else 0,
                 )
                 counts = sessions.count_steps(rows, cut)
                 stage.update()

@@ -61,6 +61,9 @@ class Cut:
     """Times (ms) at which the validation and the test split begin."""
     max_steps: int | None = None
     """Episodes with more steps are dropped; None for none."""
+    leave_last: int = 0
+    """Rows of each user, of those with more than twice as many, that test, and rows that validate;
+    0 for a split by time."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,11 @@ class Episodes:
 
 
 def split_bounds(rows: SortedRows, split: tuple[float, ...]) -> tuple[int, int]:
-    """Times (ms) at which validation and test begin, of shares of the rows or of two times."""
-    if len(split) == 2:
-        return int(split[0]), int(split[1])
+    """Times (ms) at which validation and test begin, of shares of the rows or of two times; beyond
+    the last row if users are split."""
+    if len(split) < 3:
+        times = split if len(split) == 2 else (rows.last_ms + 1,) * 2
+        return int(times[0]), int(times[1])
     begin, end = (_find_time(rows, round(rows.count * share)) for share in np.cumsum(split)[:2])
     return begin, end
 
@@ -130,6 +135,14 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         elif cut.session_by == schema.SESSION_ID:
             ends = user_ends | np.append(batch[SESSION][1:] != batch[SESSION][:-1], True)
         splits = (times >= cut.bounds[0]).astype(np.int64) + (times >= cut.bounds[1])
+        if cut.leave_last:
+            lengths = np.diff(np.flatnonzero(user_ends), prepend=-1)
+            ahead = np.repeat(np.cumsum(lengths), lengths) - np.arange(len(times))
+            splits = (ahead <= cut.leave_last).astype(np.int64) + (ahead <= 2 * cut.leave_last)
+            splits *= np.repeat(lengths > 2 * cut.leave_last, lengths)
+            # A decision with several rows is not cut.
+            places = np.arange(len(times)) - batch.get(schema.PLACE, 0)
+            splits = splits[places]
         last = np.flatnonzero(ends | np.append(splits[1:] != splits[:-1], True))
         lengths = np.diff(last, prepend=-1)
         begins_session = np.append(True, ends[last[:-1]])

@@ -172,11 +172,6 @@ class SequencePolicy(nn.Module, ABC):
         """Row K − 1 of `features`, (B, d), for acting; subclasses may omit what it ignores."""
         return self.features(windows)[:, -1]
 
-    def acting_features(self) -> Callable[[Windows], Tensor]:
-        """`last_features` of a policy in evaluation mode whose weights no longer change; subclasses
-        may prepare what then costs less."""
-        return self.last_features
-
     def normalize(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 

@@ -3,7 +3,7 @@
 Dropout, attention and convolution cost less here than PyTorch's on a CPU.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -23,11 +23,8 @@ from ucfrec.policies.base import (
     require_heads,
     some_padding,
 )
-from ucfrec.policies.heads import ItemHead
 from ucfrec.settings import Share, Weight, settings_table
 
-_FEW = 32
-"""Windows up to which calling an operation costs more than its arithmetic."""
 EPSILON = 1e-8
 """Added inside the logarithm of Eq. 5 (Table 7)."""
 _LEVELS = 2**16
@@ -123,11 +120,6 @@ class UCFPolicy(SequencePolicy):
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d): attention has a single query."""
         return self.attend(windows, slice(-1, None))[0][:, 0]
-
-    def acting_features(self) -> Callable[[Windows], Tensor]:
-        """`last_features`, with stacked weights for a few windows."""
-        is_inherited = type(self).last_features is UCFPolicy.last_features
-        return StackedStreams(self) if is_inherited else self.last_features
 
     def _fuse_streams(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
@@ -277,18 +269,10 @@ class TokenEmbedding(nn.Module):
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens of returns-to-go, states and actions, (B, K, d) each, from normalised windows and
         embedded actions (B, K, d)."""
-        time, returns, states = self._parts(windows)
-        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
-
-    def stack(self, windows: Windows, actions: Tensor) -> Tensor:
-        """The same as one tensor (3, B, K, d), with fewer operations."""
-        time, returns, states = self._parts(windows)
-        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
-
-    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
-        """Embedded time, returns-to-go and states, (B, K, d) each."""
-        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        return embed_time(self.embed_timestep, windows), returns, self.embed_state(windows.states)
+        time = embed_time(self.embed_timestep, windows)
+        returns = self.norm(self.embed_return(windows.returns_to_go.unsqueeze(-1)) + time)
+        states = self.norm(self.embed_state(windows.states) + time)
+        return returns, states, self.norm(actions + time)
 
 
 def interleave(modalities: Sequence[Tensor]) -> Tensor:
@@ -313,16 +297,8 @@ class CausalDepthwise(nn.Conv1d):
         return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
 
 
-def shift_products(steps: Tensor, taps: Tensor, bias: Tensor) -> Tensor:
-    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from steps x (..., K, d), taps w (3, ...) and bias b."""
-    out = torch.addcmul(bias, steps, taps[2])
-    for back in (1, 2):
-        out[..., back:, :].addcmul_(steps[..., :-back, :], taps[2 - back])
-    return out
-
-
 class _ShiftedProducts(torch.autograd.Function):
-    """`shift_products` of steps (B, K, d), taps (3, d) and a bias (d,), with its gradient."""
+    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, of steps x (B, K, d), taps w (3, d) and a bias b (d,)."""
 
     @staticmethod
     def forward(
@@ -332,7 +308,10 @@ class _ShiftedProducts(torch.autograd.Function):
         bias: Tensor,
     ) -> Any:
         ctx.save_for_backward(steps, taps)
-        return shift_products(steps, taps, bias)
+        out = torch.addcmul(bias, steps, taps[2])
+        for back in (1, 2):
+            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
+        return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
@@ -430,78 +409,3 @@ def mask_loss(attention: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
 def _visible(mask: Tensor) -> Tensor:
     """(B, K, 3K): true where s_t may attend to a token: itself and valid tokens before it."""
     return visible_tokens(mask.repeat_interleave(3, dim=1))[:, 0, 1::3]
-
-
-class StackedStreams:
-    """`UCFPolicy.last_features` of a trained policy, equal up to rounding: the weights of the three
-    streams are stacked once, so that every operation serves all of them."""
-
-    def __init__(self, policy: UCFPolicy) -> None:
-        """The policy is in evaluation mode; its weights must not change afterwards."""
-        self._policy = policy
-        streams = (policy.return_stream, policy.state_stream, policy.action_stream)
-        with torch.no_grad():
-            layers = zip(*(stream.blocks for stream in streams), strict=True)
-            self._blocks = [_stack_blocks(blocks) for blocks in layers]
-            self._fuse = torch.stack([part.T for part in policy.fuse.weight.chunk(3, dim=1)])
-            # The sum over the modalities known so far begins with the bias.
-            self._fuse_bias = policy.fuse.bias.expand(3, 1, -1)
-
-    @torch.no_grad()
-    def __call__(self, windows: Windows) -> Tensor:
-        """Features (B, d) from normalised windows."""
-        policy, batch = self._policy, windows.mask.shape[0]
-        # A graph that is exported may be for any batch.
-        if not isinstance(batch, int) or batch > _FEW:
-            return policy.last_features(windows)
-        head = policy.head
-        # Vectors of a few items cost less than keeping those of all.
-        embed = head.vectors if isinstance(head, ItemHead) else head.embed
-        tokens = policy.embed.stack(windows, embed(windows.actions))
-        shape, dim, mask = tokens.shape, tokens.shape[-1], some_padding(windows.mask)
-        for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
-            steps = tokens if mask is None else tokens.masked_fill(~mask.unsqueeze(-1), 0.0)
-            local = shift_products(steps, taps, bias).view(3, -1, dim)
-            rows = torch.baddbmm(pointwise_bias, local, pointwise)
-            normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,))
-            tokens = torch.addcmul(shift, normed, scale)
-        rows = tokens.view(3, -1, dim)
-        sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
-        fused = policy.fuse_norm(sums.add_(rows)).view(shape)
-        attended = self._attend_last(fused, windows.mask)
-        hidden = fused[1, :, -1] + attended
-        return policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))  # type: ignore[no-any-return]
-
-    def _attend_last(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""
-        layer, (_, batch, length, dim) = self._policy.attention, tokens.shape
-        heads, size = layer.heads, dim // layer.heads
-        last = layer.norm(tokens[1, :, -1])
-        query = layer.query(last).view(batch, heads, 1, size)
-        both = layer.key_value(layer.norm(tokens)).view(3, batch, length, 2, heads, size)
-        both = both.permute(3, 1, 4, 0, 2, 5)
-        key, value = both.reshape(2, batch, heads, -1, size)
-        scores = query @ key.transpose(-2, -1) / size**0.5  # (B, H, 1, 3K)
-        hidden = ~mask.repeat(1, 3)
-        # Its own action comes after s_t.
-        hidden[:, -1] = True
-        scores = scores.masked_fill(hidden.view(batch, 1, 1, -1), -torch.inf)
-        mixed = (scores.softmax(-1) @ value).view(batch, dim)
-        return layer.out(mixed)  # type: ignore[no-any-return]
-
-
-def _stack_blocks(blocks: tuple[torch.nn.Module, ...]) -> tuple[Tensor, ...]:
-    """The weights of one block of each stream."""
-
-    def stack(name: str) -> Tensor:
-        return torch.stack([block.get_parameter(name) for block in blocks])
-
-    taps = stack("depthwise.weight")[:, :, 0]  # (3, d, 3)
-    return (
-        taps.permute(2, 0, 1)[:, :, None, None].contiguous(),
-        stack("depthwise.bias")[:, None, None],
-        stack("pointwise.weight").mT.contiguous(),
-        stack("pointwise.bias").unsqueeze(1),
-        stack("norm.weight")[:, None, None],
-        stack("norm.bias")[:, None, None],
-    )

@@ -245,6 +245,4 @@ def describe_user_model(record: RunRecord) -> dict[str, object]:
         rows["in either half of the users"] = " and ".join(f"{v:.4g}" for v in estimate.halves)
         gain, error = estimate.correction
         rows["of it added by logged steps"] = f"{gain:+.3g} ± {error:.2g}"
-    if rule.halves_agree is not None:
-        rows["halves that choose this rule"] = sum(rule.halves_agree)
     return rows

@@ -388,8 +388,7 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
     lines += [
         f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
         "simulated users, it has the best return",
-        f"{indent}(or one level with it) that the log supports; "
-        f"{sum(choice.halves_agree or ())} of 2 halves of the users choose it.",
+        f"{indent}(or one level with it) that the log supports.",
     ]
     if estimate.doubts:
         lines += [f"{indent}Its return is not estimated: {doubt}." for doubt in estimate.doubts]

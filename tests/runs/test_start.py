@@ -35,7 +35,7 @@ from ucfrec.runs.start import new_policy, start_warm
 
 SETTINGS = ["train.steps=150", "train.validate_every=150", "policy.dim=16", "policy.context=4"]
 SETTINGS += ["train.learning_rate=0.01", "augment.copies=0", "rule.choose=false"]
-SAID = "the policy learned nothing about users; train with more steps"
+SAID = "the policy learned nothing about users; add features of users and items"
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,8 @@ class LoggedScores:
                         # What has been read for the query is not needed again.
                         queries[key] = query._replace(sessions=replace(sessions, states=None))
                     seen = seen_before(self.view, episodes, steps) if rule.exclude_seen else None
-                    yield part, number, scorer.scores_of(queries[key], excluded=seen)
+                    scores = scorer.scores_of(queries[key], excluded=seen, empty=seen is not None)
+                    yield part, number, scores
                 bar.update(len(steps))
 
 

@@ -277,6 +277,13 @@ def _describe_ranking(ranking: "Ranking") -> str:
         f"{'liked':<16}{conditions['liked']}: {conditions['liked_share']:.1%} of the steps",
         f"k is {conditions['k']}; --json has 95% intervals and paired differences by user",
     ]
+    if unseen := float(conditions["items_without_rows"] or 0):
+        lines.append(f"{unseen:.1%} of the steps show an item without training rows")
+    if new := float(conditions["users_without_rows"] or 0):
+        lines.append(
+            f"{new:.1%} of the steps are of users without training rows, for whom als and bpr rank "
+            "by popularity"
+        )
     if lost := float(conditions["out_of_reach"] or 0):
         lines.append(
             f"{lost:.1%} of the steps show an item that the user has seen, which is excluded: "
@@ -297,6 +304,6 @@ def _conclude_ranking(ranking: "Ranking", measured: Sequence[str]) -> str:
     first = "" if best is rows[0] else f"; {rows[0].method} has {rows[0].metrics[name]:.3f}"
     return (
         f"\n{best.method} has the highest hit rate on liked items ({best.metrics[name]:.3f} with "
-        f"{best.conditions['k']} items){first}. Logged clicks favour what was shown:\n"
+        f"{best.conditions['k']} items){first}. Logged clicks favour what was shown.\n"
         f"next: ucfrec ope {shlex.join(measured)}, the return per session that it would bring"
     )

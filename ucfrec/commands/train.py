@@ -54,8 +54,7 @@ class Train(TrainingOptions):
     """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
     `ope` on the test split use the weights before that)"""
     goal: Literal["rank", "reward"] | None = None
-    """What recommendations are for: to `rank` what users choose next, as --set rule.choose=false,
-    or to bring the most `reward`, by a decision rule (default: reward, where rewards vary)"""
+    """`rank` what users choose next, or bring the most `reward` (default: reward)"""
     evidence: int | None = None
     """Effective users that the decision rule must leave in the validation sessions; where the log
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""

@@ -215,6 +215,11 @@ def ranking_rows(
     if liked is not None and fitted_on is not None:
         counts = TrainingCounts.of(fitted_on, liked)
     unnamed: list[tuple[str, Ranker]] = [(policy.name, policy.scores) for policy in policies]
+    for policy in policies:
+        if policy.rule.reward_weight and policy.rule.policy_weight:
+            alone = replace(policy.rule, reward_weight=0.0, lookahead=0.0)
+            without = PolicyRanker(policy.trained, alone)
+            unnamed.append((f"{policy.name}, weight 0", without.scores))
     if trained.reward_model is not None:
         scorer = trained.scorer()
 
@@ -245,6 +250,8 @@ def ranking_rows(
             "reference": reference,
             "filter_seen": later.filter_seen,
             "out_of_reach": later.share_out_of_reach(),
+            "items_without_rows": float((counts.shown[period.items] == 0).float().mean()),
+            "users_without_rows": _share_of_new_users(later.store, fitted_on),
             "liked": str(liked or describe_liked(trained.item_states)),
             "liked_share": float(period.liked.mean()),
         },
@@ -255,6 +262,14 @@ def ranking_rows(
         _row(name, measured, policy_rankers.get(name), shared)
         for name, measured in compare(period, ranked, reference, seed).items()
     ]
+
+
+def _share_of_new_users(later: EpisodeStore, train: EpisodeStore | None) -> float | None:
+    """Share of steps of users without training rows."""
+    if train is None:
+        return None
+    is_known = np.isin(later.episode_values(schema.USER), train.episode_values(schema.USER))
+    return float(later.lengths[~is_known].sum() / later.n_steps)
 
 
 def _row(

@@ -242,7 +242,8 @@ class RunRecord(TrainingRecord):
         return self.fingerprint == store.fingerprint and same_states
 
     def learned_nothing(self, logged: Container[str]) -> str:
-        """A warning if a policy of items predicts logged choices no better than popularity does.
+        """A warning if a policy of items predicts logged choices no better than popularity or
+        chance does.
 
         Args:
             logged: names of the scalars that the training logged; without `action_loss` among them,
@@ -252,14 +253,16 @@ class RunRecord(TrainingRecord):
             What was found and what to do; empty if nothing was, or can be compared.
         """
         best = math.nan if self.policy is None else self.policy.best_validation
-        popularity = (self.reference_losses or {}).get("popularity")
-        if popularity is None or "action_loss" not in logged or not best >= popularity:
+        losses = self.reference_losses or {}
+        name = min(losses, key=losses.__getitem__, default="")
+        if not name or "action_loss" not in logged or not best >= losses[name]:
             return ""
+        how = {"popularity": "by popularity", "uniform": "at random"}[name]
         return (
-            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
-            "showing items by popularity: the policy learned nothing about users; train with more "
-            "steps or a higher train.learning_rate, add features of users and items or more "
-            "history, or use --policy item-rate (expected where the log was drawn at random)"
+            f"the best validation loss, {best:.4g}, is not below {losses[name]:.4g}, the loss of "
+            f"showing items {how}: the policy learned nothing about users; add features of users "
+            "and items or more history, train with more steps, or use --policy recent-clicks "
+            "(expected where the log was drawn at random)"
         )
 
     def describe(self, logged: Container[str] = ()) -> str:

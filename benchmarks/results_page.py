@@ -428,7 +428,7 @@ def _origin(rows: Sequence[ResultRow], command: str) -> str:
 
 RUN = "ucfrec benchmark recommendation --table"
 CONTROL = "ucfrec-control benchmark --data $UCFREC_DATA/control --budget small --table"
-IN_TAG = "(in the git tag `benchmarks-2026-11`)"
+IN_HISTORY = "(a script of earlier commits)"
 SECTIONS = (
     Section(
         "Recommendation",
@@ -471,7 +471,7 @@ SECTIONS = (
         "the strength of a planted confounder of each session. Over all sizes in percent of the "
         "return without augmentation. Augmented actions gain with a confounder and nothing "
         "without; augmented states change nothing significant.",
-        f"`python benchmarks/counterfactual_copies.py --out runs/copies` {IN_TAG}",
+        f"`python benchmarks/counterfactual_copies.py --out runs/copies` {IN_HISTORY}",
         of("counterfactual_copies", "counterfactual-copies"),
         augmentation,
     ),
@@ -543,7 +543,7 @@ SECTIONS = (
         "UCF and LSDT without a history are level and have the highest means of the small budget: "
         "MuJoCo's observation is the whole state, and a history adds only who acted with what "
         "noise.",
-        f"`python benchmarks/control_histories.py --out runs/control` {IN_TAG}",
+        f"`python benchmarks/control_histories.py --out runs/control` {IN_HISTORY}",
         histories,
         partial(scores, references=("ucf-wo-count-best-25-x2-context-1",)),
     ),
@@ -552,7 +552,7 @@ SECTIONS = (
         "10,000 steps in batches of 64 windows of 8 steps at width 128, learning rate 1e-3, 50 "
         "episodes. Each training gives both: the weights of a step, and their exponential moving "
         "average (0.999). Checkpoints are 1,000 steps apart, the last ones of each training.",
-        f"`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count` {IN_TAG}",
+        f"`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count` {IN_HISTORY}",
         of("control_spread", "spread"),
         spread,
     ),

@@ -49,7 +49,7 @@ class DecisionRule:
     """Target returns are at least this, also once a session has reached its target; None for no
     minimum."""
     reward_weight: Weight = 0.0
-    """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
+    """Weight β of the reward model, whose predictions are log-odds of a reward, or rewards in
     standard deviations; 0 for none."""
     policy_weight: Weight = 1.0
     """w, weight of the policy; 0 for none."""

@@ -188,7 +188,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     conflicts = f"  duplicates with a different reward from the kept row, the {rule}"
     counts += [
         ("  conflicting duplicates", report["conflicting_duplicates"], conflicts),
-        ("  at equal times", report["equal_times"], " (in no order that could be learned)"),
+        ("  at equal times", report["equal_times"], " (lists, or in no order to learn)"),
         ("  out of order", report["unsorted_rows"], " (sorted, none dropped)"),
         ("steps kept", report["steps"], ""),
         ("users", report["users"], ""),

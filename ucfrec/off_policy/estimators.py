@@ -288,12 +288,13 @@ def resample(
         )
         for values in (above, below)
     )
-    value = above.sum(axis=0) / below.sum(axis=0)
-    # In units that keep squares of large weights finite.
-    size = np.abs(below).max(axis=0)
-    e, b = (above - value * below) / size, below / size
-    correction = np.sqrt(clusters / max(clusters - 1, 1))
-    error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # where nothing has weight
+        value = above.sum(axis=0) / below.sum(axis=0)
+        # In units that keep squares of large weights finite.
+        size = np.abs(below).max(axis=0)
+        e, b = (above - value * below) / size, below / size
+        correction = np.sqrt(clusters / max(clusters - 1, 1))
+        error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
     moments = np.concatenate([e, b, e * e, e * b, b * b], axis=1)
     # How often each cluster is drawn stands for the resampled rows; as floats, some at a time.
     counts = np.array_split(_draw_counts(clusters, seed), max(1, clusters // _CLUSTERS_AT_ONCE))

@@ -75,8 +75,8 @@ def rank_with_ucfrec(folder: Path, seed: int, policy: str) -> tuple[list[float],
         columns += ["--column", name]
     store, log = folder / "store", folder / "first.parquet"
     if not store.exists():
-        options = ("--reward", "rating", "--session-by", "user", "--split", "0.89,0.11,0")
-        run(*ours, "prepare", log, "--out", store, *columns, *options)
+        how = ("--reward", "rating", "--session-by", "user", "--split", "0.89,0.11,0")
+        run(*ours, "prepare", log, "--out", store, *columns, *how)
     options = ("--policy", policy, "--seed", str(seed), "--threads", "1", "--goal", "rank")
     _, seconds = run(*ours, "train", store, "--out", out, *options)
     run(*ours, "rank", out, folder / "later.parquet", *columns, "--json", out.with_suffix(".json"))

@@ -37,7 +37,7 @@ RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
 PICTURES = ROOT / "docs" / "assets" / "tables"
 FILES = (
     *("recommendation", "counterfactual_copies"),
-    *("control", "control_medium", "control_robustness", "control_histories", "control_spread"),
+    *("control", "control_medium", "control_robustness", "control_spread"),
 )
 PAPER = """\
 | method | KuaiRand R_cum | R_avg | KuaiRec R_cum | R_avg | VirtualTB R_cum | R_avg |
@@ -348,26 +348,6 @@ def robustness(rows: Sequence[ResultRow]) -> str:
     return "\n\n".join(parts)
 
 
-def spread(rows: Sequence[ResultRow]) -> str:
-    """Standard deviations of scores, raw and averaged, over seeds and over last checkpoints."""
-    lines = []
-    groups = grouped(rows, lambda row: (row.task, row.method, str(row.conditions["weights"])))
-    for (task, method, weights), group in groups.items():
-        last = summary(r.value for r in group if r.conditions["checkpoints_before_last"] == 0)
-        trainings = grouped(group, lambda row: row.training_seed).values()
-        within = [summary(row.value for row in training) for training in trainings]
-        over_last = summary(w.sd**2 for w in within if w.count > 1).mean ** 0.5
-        score, sd_seeds, sd_last = (
-            NONE if math.isnan(value) else rounded(value)
-            for value in (last.mean, last.sd, over_last)
-        )
-        count = max(w.count for w in within)
-        named = (task.removesuffix("-zoo"), method, weights)
-        lines.append((*named, last.count, score, sd_seeds, count, sd_last))
-    head = ("file", "method", "weights", "seeds", "score", "sd over seeds", "checkpoints")
-    return markdown_table((*head, "sd over checkpoints"), lines)
-
-
 def contexts(rows: Sequence[ResultRow]) -> str:
     """Scores by context, and their mean where every file has one."""
     tasks = list(dict.fromkeys(row.task for row in rows))
@@ -386,13 +366,6 @@ def contexts(rows: Sequence[ResultRow]) -> str:
 def of(name: str, table: str) -> Callable[[_Files], Sequence[ResultRow]]:
     """Chooses the rows of a table of a file."""
     return lambda files: [row for row in files.get(name, ()) if row.table == table]
-
-
-def histories(files: _Files) -> Sequence[ResultRow]:
-    """Rows of shorter histories on the best quarter, and those they are compared with."""
-    same_time = [r for r in of("control", "equal-time")(files) if "-25" in r.method]
-    cloning = [r for r in of("control", "main")(files) if r.method in ("bc-10", "bc-25")]
-    return [*files.get("control_histories", ()), *same_time, *cloning]
 
 
 @dataclass(frozen=True)
@@ -534,27 +507,6 @@ SECTIONS = (
         f"`{CONTROL} equal-time`",
         of("control", "equal-time"),
         partial(scores, references=("ucf-x2", "ucf-wo-count-x2", "ucf-wo-count-best-25-x2")),
-    ),
-    Section(
-        "Control: the value of a history",
-        "Trained on the best quarter of the trajectories, with histories of 1 and of 5 steps "
-        "(`context`) at as many predictions per update, beside the rows with 20 steps and behavior "
-        "cloning. Tried after the scores with 20 steps on `hopper_medium-expert` were seen. "
-        "UCF and LSDT without a history are level and have the highest means of the small budget: "
-        "MuJoCo's observation is the whole state, and a history adds only who acted with what "
-        "noise.",
-        f"`python benchmarks/control_histories.py --out runs/control` {IN_HISTORY}",
-        histories,
-        partial(scores, references=("ucf-wo-count-best-25-x2-context-1",)),
-    ),
-    Section(
-        "Control: raw and averaged weights",
-        "10,000 steps in batches of 64 windows of 8 steps at width 128, learning rate 1e-3, 50 "
-        "episodes. Each training gives both: the weights of a step, and their exponential moving "
-        "average (0.999). Checkpoints are 1,000 steps apart, the last ones of each training.",
-        f"`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count` {IN_HISTORY}",
-        of("control_spread", "spread"),
-        spread,
     ),
     Section(
         "Control: the best quarter of the trajectories",

@@ -44,7 +44,7 @@ class LoopConfig:
     """Learning rate after the warm-up."""
     weight_decay: WeightDecay = 1e-4
     """Weight decay of AdamW."""
-    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 50
+    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 500
     """Steps over which the learning rate rises linearly from 0 to `learning_rate`; a training with
     fewer steps ends before it reaches that."""
     cosine: bool = False

@@ -251,7 +251,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     if isinstance(policy.head, ItemHead):
         counts = torch.from_numpy(train.item_counts()).float()
         policy.head.start_from(train.item_states.embeddings, counts, _count_even_draws(train))
-        if not policy.literal:
+        if not (policy.literal or train.has_offers):
             policy.begin_with_items()
         if policy.head.exposure is not None:
             scaled = torch.from_numpy(returns_to_go) / policy.return_scale

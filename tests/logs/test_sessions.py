@@ -8,8 +8,9 @@ import pytest
 
 from tests.support.logs import START
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 
 
 def write_log(folder: Path, times: np.ndarray, **columns: object) -> Path:
@@ -78,3 +79,23 @@ def test_clocks_that_differ_do_not_split_sessions(tmp_path: Path, skew: int) -> 
     options = PrepareOptions(session_by="gap", reward="reward", split=(1.0, 0.0, 0.0))
     prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
     assert EpisodeStore.open(tmp_path / "store").lengths.tolist() == [3, 2] * 20
+
+
+@pytest.mark.parametrize("last", [1, 3])
+def test_the_last_rows_of_every_user_test(tmp_path: Path, last: int) -> None:
+    rng = np.random.default_rng(0)
+    parts = {"user_id": rng.integers(40, size=300), "item_id": rng.integers(9, size=300)}
+    times = START + 60_000 * rng.permutation(300)
+    log = pd.DataFrame({**parts, "timestamp": times, "reward": rng.random(300)})
+    log.to_parquet(tmp_path / "log.parquet")
+    name = "out" if last == 1 else str(last)
+    options = PrepareOptions(session_by="user", split=parse_split(f"leave-last-{name}"))
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
+    found = EpisodeStore.open(tmp_path / "store").to_frame().sort_values(["user_id", "timestamp"])
+    of_user = log.sort_values(["user_id", "timestamp"]).groupby("user_id").item_id
+    ahead, rows = of_user.cumcount(ascending=False), of_user.transform("size")
+    split = np.where(ahead < last, "test", np.where(ahead < 2 * last, "validation", "train"))
+    np.testing.assert_array_equal(found.split, np.where(rows > 2 * last, split, "train"))
+    for wrong in ("leave-last-0", "leave-last-some"):
+        with pytest.raises(InputError, match="split"):
+            PrepareOptions(split=parse_split(wrong))

@@ -94,7 +94,7 @@ class PrepareOptions:
         )
         times = len(self.split) == 2 and self.split[0] <= self.split[1]
         shares = len(self.split) == 3 and min(self.split) >= 0 and self.split[0] > 0
-        last = len(self.split) == 1 and self.split[0] >= 1
+        last = len(self.split) == 1 and self.split[0] >= 1 and float(self.split[0]).is_integer()
         require(
             last or times or (shares and math.isclose(sum(self.split), 1, abs_tol=1e-9)),
             f"split is {self.split}: give three shares that add up to 1, the first above 0, "

@@ -89,7 +89,7 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "equal_times": rows.tied,
         "session_by": cut.session_by,
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
-        "split_times_ms": list(cut.bounds),
+        "split_times_ms": None if cut.leave_last else list(cut.bounds),
         "summary": _measure_distributions(rows, cut, counts),
         "steps": counts.steps,
         "episodes": sum(split["episodes"] for split in splits.values()),

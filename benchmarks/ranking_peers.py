@@ -5,8 +5,8 @@
 
 The log is that of `examples/make_ratings_log.py`. The later tenth of the ratings is judged, each
 from all that the user had rated before, among films that the user has not rated; films without
-training rows count as misses. RecTools: softmax, 20 epochs, width 64. CPU seconds are of one
-thread, for RecTools with the ranking, for ours with the refit.
+training rows count as misses. Both have width 64; RecTools learns for 20 epochs by softmax. CPU
+seconds are of one thread, for RecTools with the ranking, for ours with the refit.
 """
 
 import argparse
@@ -78,6 +78,7 @@ def rank_with_ucfrec(folder: Path, seed: int, policy: str) -> tuple[list[float],
         how = ("--reward", "rating", "--session-by", "user", "--split", "0.89,0.11,0")
         run(*ours, "prepare", log, "--out", store, *columns, *how)
     options = ("--policy", policy, "--seed", str(seed), "--threads", "1", "--goal", "rank")
+    options += ("--set", "policy.dim=64")
     _, seconds = run(*ours, "train", store, "--out", out, *options)
     run(*ours, "rank", out, folder / "later.parquet", *columns, "--json", out.with_suffix(".json"))
     row = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))[0]

@@ -79,7 +79,8 @@ def read_split(name: str, value: object) -> tuple[float, ...]:
         InputError: `value` is neither.
     """
     if not isinstance(value, Iterable):
-        raise InputError(f"{name} is {shown(value)}; give three shares, two times or 'leave-last-out'")
+        forms = "three shares, two times or 'leave-last-out'"
+        raise InputError(f"{name} is {shown(value)}; give {forms}")
     parts = [value] if isinstance(value, str) else list(value)
     if all(isinstance(part, Real) for part in parts):
         return tuple(float(part) for part in parts)

@@ -20,10 +20,11 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     """Go on training the policy of the finished run `first`, on all episodes of its store.
 
     Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
-    model's effects and the decision rule are those of `first`. The best weights are trained for
-    as many steps as the training had, while the learning rate falls to 0; policies that are fitted
-    without gradients are fitted again. Item embeddings stay those of the store's training split.
-    There is nothing left to evaluate the policy on but later logs.
+    model's effects and the decision rule are those of `first`. The best weights are trained for as
+    many steps as the training had, or where items come and go as these weights had, while the
+    learning rate falls to 0; policies that are fitted without gradients are fitted again. Item
+    embeddings stay those of the store's training split. There is nothing left to evaluate the
+    policy on but later logs.
 
     Args:
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
@@ -48,7 +49,8 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     if chosen.dropped_observations:
         store = store.without_observation_dimensions(chosen.dropped_observations)
     config = chosen.config
-    steps = chosen.finished.steps
+    # Items that come and go are soon known too well.
+    steps = chosen.finished.best_step if store.has_offers else chosen.finished.steps
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))

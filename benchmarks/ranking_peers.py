@@ -1,6 +1,6 @@
 """Rank later ratings by our SASRec and by that of RecTools, trained on the same rows; resumes.
 
-    python -m venv peer && peer/bin/pip install "rectools[torch]==0.19.0" pyarrow
+    python -m venv peer && peer/bin/pip install "rectools[torch]==0.19.0"
     python benchmarks/ranking_peers.py --out runs/peers --peer peer/bin/python --seeds 3
 
 The log is that of `examples/make_ratings_log.py`. The later tenth of the ratings is judged, each
@@ -33,7 +33,8 @@ def rank_with_rectools(folder: Path, seed: int) -> None:
 
     torch.set_num_threads(1)
     seed_everything(seed)
-    first, later = (pd.read_parquet(folder / f"{name}.parquet") for name in ("first", "later"))
+    files = (folder / f"{name}.csv" for name in ("first", "later"))
+    first, later = (pd.read_csv(file, parse_dates=["rated_at"]) for file in files)
     names = {"user": Columns.User, "film": Columns.Item, "rated_at": Columns.Datetime}
     rows = first.rename(columns=names).assign(**{Columns.Weight: 1.0})
     sizes = {"n_factors": 64, "n_blocks": 2, "n_heads": 1, "session_max_len": LENGTH}
@@ -44,7 +45,8 @@ def rank_with_rectools(folder: Path, seed: int) -> None:
     numbers = {film: n for n, film in enumerate(data.item_id_map.external_ids)}
     history, gains = defaultdict(list), []
     for user, film in zip(first.user, first.film, strict=True):
-        history[user].append(numbers[film])
+        # RecTools leaves out users of one film, and with them some films.
+        history[user] += [numbers[film]] if film in numbers else []
     with torch.no_grad():
         vectors = network.item_model.get_all_embeddings()
         for user, film in zip(later.user, later.film, strict=True):
@@ -55,7 +57,7 @@ def rank_with_rectools(folder: Path, seed: int) -> None:
             scores[[*range(data.n_item_extra_tokens), *seen]] = -torch.inf
             place = 1 + int((scores > scores[number]).sum()) if number >= 0 else K + 1
             gains.append(1 / float(torch.log2(torch.tensor(place + 1.0))) if place <= K else 0.0)
-            seen.extend([number] if number >= 0 else [])
+            seen += [number] if number >= 0 else []
     print(json.dumps([sum(gain > 0 for gain in gains) / len(gains), sum(gains) / len(gains)]))
 
 
@@ -73,16 +75,16 @@ def rank_with_ucfrec(folder: Path, seed: int, policy: str) -> tuple[list[float],
     ours, out, columns = (sys.executable, "-m", "ucfrec"), folder / f"{policy}-{seed}", []
     for name in ("user_id=user", "item_id=film", "timestamp=rated_at"):
         columns += ["--column", name]
-    store, log = folder / "store", folder / "first.parquet"
+    store, log = folder / "store", folder / "first.csv"
     if not store.exists():
         how = ("--reward", "rating", "--session-by", "user", "--split", "0.89,0.11,0")
         run(*ours, "prepare", log, "--out", store, *columns, *how)
     options = ("--policy", policy, "--seed", str(seed), "--threads", "1", "--goal", "rank")
     options += ("--set", "policy.dim=64")
     _, seconds = run(*ours, "train", store, "--out", out, *options)
-    run(*ours, "rank", out, folder / "later.parquet", *columns, "--json", out.with_suffix(".json"))
+    run(*ours, "rank", out, folder / "later.csv", *columns, "--json", out.with_suffix(".json"))
     row = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))[0]
-    share = row["conditions"]["steps"] / len(pd.read_parquet(folder / "later.parquet"))
+    share = row["conditions"]["steps"] / len(pd.read_csv(folder / "later.csv"))
     return [share * row["metrics"][name] for name in ("hit_rate_shown", "ndcg_shown")], seconds
 
 
@@ -101,8 +103,8 @@ def main() -> None:
     maker = Path(__file__).parents[1] / "examples" / "make_ratings_log.py"
     log = runpy.run_path(str(maker))["make_log"](options.out, options.log)
     cut = len(log) * 9 // 10
-    log[:cut].to_parquet(options.out / "first.parquet")
-    log[cut:].to_parquet(options.out / "later.parquet")
+    log[:cut].to_csv(options.out / "first.csv", index=False)
+    log[cut:].to_csv(options.out / "later.csv", index=False)
     print("| method | seed | HR@10 | NDCG@10 | CPU s |\n|---|---|---|---|---|")
     for seed in range(options.seeds):
         for policy in options.policy or ["sasrec"]:

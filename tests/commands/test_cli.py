@@ -348,14 +348,14 @@ def test_ope(catalog: Catalog, temperature: int, tmp_path: Path, capsys: Capsys)
 
 
 def test_ope_agrees_with_rollouts(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
-    arguments = f"{catalog[0]} --temperature 3 --reward-weight 0"
+    arguments = f"{catalog[0]} --temperature 2.5 --reward-weight 0"
     rows, _ = estimate(arguments, collect_at_random(tmp_path, 3000), tmp_path, capsys)
     trained = TrainedPolicy.load(Path(catalog[0]))
-    actor = trained.actor(512, replace(trained.rule, temperature=3.0, reward_weight=0.0))
+    actor = trained.actor(512, replace(trained.rule, temperature=2.5, reward_weight=0.0))
     env = Environment("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 4000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 4000**0.5
-    assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
+    assert abs(truth - rows["logged"]["R_cum"]) > 2 * error
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]
         assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
@@ -394,7 +394,7 @@ def test_model_card(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
 
 def test_ope_ranks_rules(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
     run, logs = catalog[0], collect_at_random(tmp_path, 1500, seed=7)
-    arguments = f"{run} --targets q0.5,6 --temperatures 3,0 --reward-weight 0"
+    arguments = f"{run} --targets q0.5,6 --temperatures 2,0 --reward-weight 0"
     _, printed = estimate(arguments, logs, tmp_path, capsys)
     rows = read_results(tmp_path / "rows.json")
     names = list(dict.fromkeys(row.details["candidate"] for row in rows))

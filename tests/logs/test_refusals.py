@@ -147,7 +147,6 @@ LOGS: dict[str, tuple[Act, str]] = {
         log_with(propensity=[0.5] * 390 + [-1] * 9 + [0]),
         r"is not above 0, down to -1, in 10 of 400 rows.*nullif\(propensity, -1\)",
     ),
-    "equal rewards": (log_with(reward=1.0), r"all 400 rewards equal 1.*another reward"),
     "no finite reward": (log_with(reward=np.nan), r"no row is left .*NaN"),
     "a reward beyond float32": (
         log_with(reward=[0.0, 1] * 199 + [2e38, -1e13]),

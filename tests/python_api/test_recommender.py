@@ -423,7 +423,7 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     "settings is None; give a list of texts": lambda *_: Recommender(settings=None),
     r"no policy is called \['dt'\]; choose from": lambda *_: Recommender(["dt"]),
     "gap_minutes is '30'; give a fin": lambda p, log: p.fit(log, gap_minutes="30"),
-    "split is 0.8; give three shares or two": lambda p, log: p.fit(log, split=0.8),
+    "split is 0.8; give three shares, two": lambda p, log: p.fit(log, split=0.8),
     "split '1,x': write shares as .* ISO": lambda p, log: p.fit(log, split=(1, "x")),
     "reward is 1; give text": lambda p, log: p.fit(log, reward=1),
     "on_step is 3; give a function": lambda p, log: p.fit(log, on_step=3),

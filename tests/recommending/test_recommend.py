@@ -129,7 +129,7 @@ def test_scores_are_the_policys_at_the_next_step(
     found = policy.recommend(given, k=30, rule=DecisionRule(7.0), filter_seen=False)
     scores = found.pivot_table(index="user_id", columns="item_id", values="score")
     assert scores.index.tolist() == users.tolist()
-    np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=5e-4, atol=1e-5)
 
 
 def test_the_latest_session_makes_the_state_but_all_is_seen(

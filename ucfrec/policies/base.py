@@ -203,8 +203,7 @@ class SequencePolicy(nn.Module, ABC):
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
         normalized = self.normalize(windows)
-        features = self.features(normalized)[:, -1]
-        exposed = self.exposed(normalized, last=True)
+        features, exposed = self.last_features(normalized), self.exposed(normalized, last=True)
         return self.head.losses(features, windows.actions[:, -1], exposed).mean()
 
     def act(self, windows: Windows) -> Tensor:

@@ -30,7 +30,7 @@ EXTRA = {
     "edt4rec": ["policy.cql_steps=20"],
     "lsdt": ["policy.kernel_groups=4"],
     "sasrec": ["train.steps=120", "train.learning_rate=0.005"],
-    "gsasrec": ["train.steps=80", "train.learning_rate=0.005"],
+    "gsasrec": ["train.steps=160", "train.learning_rate=0.005"],
 }
 
 

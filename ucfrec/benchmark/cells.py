@@ -129,7 +129,7 @@ class Budget:
         preset = resolve_config(method.policy, presets=presets).train
         values = dict(setting.split("=", 1) for setting in self.settings)
         steps = min(int(values.get("train.steps", preset.steps)), preset.steps)
-        warmup = preset.warmup_steps * steps // preset.steps
+        warmup = preset.warmup * steps // preset.steps
         rarely = tuple(s for s in self.settings if s.startswith("train.validate_every="))
         return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *rarely, *method.settings)
 

@@ -44,9 +44,9 @@ class LoopConfig:
     """Learning rate after the warm-up."""
     weight_decay: WeightDecay = 1e-4
     """Weight decay of AdamW."""
-    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 500
-    """Steps over which the learning rate rises linearly from 0 to `learning_rate`; a training with
-    fewer steps ends before it reaches that."""
+    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] | None = None
+    """Steps over which the learning rate rises linearly from 0 to `learning_rate`; unset for a
+    twentieth of all, at most 500."""
     cosine: bool = False
     """After the warm-up, lower the learning rate along a cosine, to 0 at the last step, instead of
     keeping it constant."""
@@ -63,6 +63,11 @@ class LoopConfig:
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
     """Decay of an exponential moving average of the weights after the warm-up. It is validated and
     saved as the trained weights; 0 for the weights of the last step themselves."""
+
+    @property
+    def warmup(self) -> int:
+        """Steps of the warm-up."""
+        return min(500, self.steps // 20) if self.warmup_steps is None else self.warmup_steps
 
 
 @dataclass(frozen=True)
@@ -203,7 +208,7 @@ class _Training:
         self._optimizer = RowAdamW(module.parameters(), lr=rate, weight_decay=decay, fused=True)
         self._average = None
         if config.average:
-            self._average = WeightAverage(module, config.average, config.warmup_steps)
+            self._average = WeightAverage(module, config.average, config.warmup)
         self.counters: dict[str, float] = {"step": 0, "best_step": 0, "stale": 0, "seconds": 0.0}
         self.counters["best_validation"] = math.inf
         if self._last.exists():
@@ -249,9 +254,9 @@ class _Training:
         if count is not None:
             distributed.average_gradients(self._module.parameters(), count)
         norm = clip_gradients(self._module.parameters(), config.clip_norm)
-        rate = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
-        if config.cosine and step >= config.warmup_steps:
-            done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+        rate = config.learning_rate * min(1.0, step / max(1, config.warmup))
+        if config.cosine and step >= config.warmup:
+            done = (step - config.warmup) / max(1, config.steps - config.warmup)
             rate = rate * (1 + math.cos(math.pi * done)) / 2
         for group in self._optimizer.param_groups:
             group["lr"] = rate

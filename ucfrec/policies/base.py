@@ -138,11 +138,15 @@ class SequencePolicy(nn.Module, ABC):
 
     def begin_with_items(self) -> None:
         """Let items say more than their places at the begin of a training: embeddings of places
-        are small, and products with item vectors are not divided by √d, so that these learn as fast
-        as the rest. Where items come and go, the vectors of new ones would be noise."""
+        are small, and products with item vectors are not divided by √d, so that these, which begin
+        near 0, learn as fast as the rest. Where items come and go, the vectors of new ones would be
+        noise."""
         for name, module in self.named_modules():
             if name.endswith(("embed_timestep", "embed_position")):
                 draw_normal(module.weight, std=0.02)
+            elif name == "head.project":
+                draw_normal(module.weight, std=0.02 / self.config.dim**0.5)
+                nn.init.zeros_(module.bias)
             elif name == "final_norm":
                 nn.init.constant_(module.weight, self.config.dim**0.5)
 

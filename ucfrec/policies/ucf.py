@@ -170,6 +170,7 @@ class UCFPaperPolicy(UCFPolicy):
     literal = True
     presets: ClassVar[Mapping[str, Any]] = {
         "train.learning_rate": 1e-4,
+        "train.warmup_steps": 500,
         "train.validate_every": 500,
         "train.patience": 0,
         "crm.mean_first": False,

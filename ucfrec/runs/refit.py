@@ -51,7 +51,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     config = chosen.config
     # Items that come and go are soon known too well.
     steps = chosen.finished.best_step if store.has_offers else chosen.finished.steps
-    warmup = min(config.train.warmup_steps, steps // 10)
+    warmup = min(config.train.warmup, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))
     record = train_run(store, out, config, entries, refit_of=first)

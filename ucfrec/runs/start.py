@@ -304,7 +304,7 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
 def warm_settings(config: Config) -> Config:
     """The settings of a warm training, of `_SHARE` of the steps and epochs of one from scratch."""
     steps = max(1, round(_SHARE * config.train.steps))
-    warmup = min(config.train.warmup_steps, steps // 10)
+    warmup = min(config.train.warmup, steps // 10)
     every = min(config.train.validate_every, steps)
     train = replace(config.train, steps=steps, warmup_steps=warmup, validate_every=every)
     epochs = max(1, round(_SHARE * (config.crm.epochs or _CRM_EPOCHS)))

@@ -1,7 +1,7 @@
 """Which settings a search varies, and over which values."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -138,13 +138,7 @@ class Search:
         if "rule.reward_weights" in values:
             # Rules with a lookahead have other weights, which would take the place of the trial's.
             settings.setdefault("rule.lookaheads", (0.0,))
-        config = resolve_config(policy, None, settings, self.seed)
-        warmup = config.train.warmup_steps
-        if "train.warmup_steps" not in settings and config.train.steps < 4 * warmup:
-            # A training that ends in its warm-up never reaches the learning rate of the trial.
-            shorter = replace(config.train, warmup_steps=config.train.steps // 10)
-            config = replace(config, train=shorter)
-        return config
+        return resolve_config(policy, None, settings, self.seed)
 
     def suggest(self, trial: Trial) -> tuple[str, dict[str, Value]]:
         """The policy and settings of a trial."""

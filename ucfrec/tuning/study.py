@@ -299,8 +299,6 @@ def _write_report(study: Study, plan: Plan, config: Config) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
     file = plan.out / BEST_TOML
     names = {*study.best_params} - {POLICY}
-    if "train.steps" in names:
-        names.add("train.warmup_steps")
     chosen, tables = asdict(config), dict[str, str]()
     for name in sorted({*plan.search.fixed, *names}):
         table, _, field = name.partition(".")

@@ -25,7 +25,7 @@ SETTINGS = ("train.learning_rate=1e-3", "policy.dim=32", "policy.context=10")
 SETTINGS += ("policy.exposure=true", "rule.sessions=20")
 SMALLER = {
     "shop": {
-        "SESSIONS, ITEMS = 1000": "SESSIONS, ITEMS = 100",
+        "SESSIONS, ITEMS = 3000": "SESSIONS, ITEMS = 100",
         "--set policy.dim=32 2>": "--set policy.dim=32 --set rule.sessions=10 2>",
     },
     "evaluation": {

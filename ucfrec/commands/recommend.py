@@ -107,7 +107,7 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     new_session: Annotated[bool, Group("answering")] = False
     """Recommend for the first step of a new session (default: the user's latest one goes on)"""
     at: Annotated[str | None, Group("answering"), "TIME"] = None
-    """Time of the requests, ISO 8601 or ms, at which items must be available (default: now)"""
+    """Time of the requests, ISO 8601 or ms: items must be available, rows earlier (default: now)"""
     approximate: Annotated[bool, Group("answering")] = False
     """Find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule without a
     temperature; says the recall (default: exactly)"""

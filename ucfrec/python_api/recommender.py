@@ -279,7 +279,7 @@ class Recommender:
                 candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
             at: time of the requests, ISO 8601 or ms: only items that are available then are
-                recommended. None for now.
+                recommended, and rows from then on are not read. None for now.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on
                 the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the

@@ -93,8 +93,8 @@ def decide(
         at: time of the requests, ISO 8601 or ms: items that are not available then are not
             recommended; None for now.
         seed: of the draws of a rule with a temperature, or that explores. They also depend on the
-            user and the time of the user's last row: the same history gives the same items, and a
-            later one draws anew.
+            user, the candidates, the time of the user's last row, and `at` or, where items come and
+            go, the time: the same request gives the same items, and a later one draws anew.
         index: finds the items approximately, by the same rule; None to find them exactly.
 
     Returns:

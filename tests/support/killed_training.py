@@ -48,7 +48,7 @@ def train(folder: Path) -> Fit:
     def validate() -> float:
         return float(F.mse_loss(net(held_out[0]), held_out[1]))
 
-    own = {"learning_rate": 0.05, "warmup_steps": 50, "clip_norm": 1.0}
+    own = {"learning_rate": 0.05, "warmup_steps": 50, "clip_norm": 1.0, "patience": 0}
     config = LoopConfig(steps=STEPS, batch_size=8, validate_every=EVERY, **own)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:

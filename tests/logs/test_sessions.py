@@ -96,6 +96,6 @@ def test_the_last_rows_of_every_user_test(tmp_path: Path, last: int) -> None:
     ahead, rows = of_user.cumcount(ascending=False), of_user.transform("size")
     split = np.where(ahead < last, "test", np.where(ahead < 2 * last, "validation", "train"))
     np.testing.assert_array_equal(found.split, np.where(rows > 2 * last, split, "train"))
-    for wrong in ("leave-last-0", "leave-last-some"):
+    for wrong in ("leave-last-0", "leave-last-some", "leave-last-1.5", f"leave-last-{'9' * 400}"):
         with pytest.raises(InputError, match="split"):
             PrepareOptions(split=parse_split(wrong))

@@ -54,7 +54,7 @@ class Train(TrainingOptions):
     """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
     `ope` on the test split use the weights before that)"""
     goal: Literal["rank", "reward"] | None = None
-    """`rank` what users choose next, or bring the most `reward` (default: reward)"""
+    """`rank` what users choose next, or bring the most `reward` (default: reward, if it varies)"""
     evidence: int | None = None
     """Effective users that the decision rule must leave in the validation sessions; where the log
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""

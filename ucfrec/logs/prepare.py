@@ -109,7 +109,7 @@ def parse_split(text: str) -> tuple[float, ...]:
     parts, last = text.split(","), text.removeprefix("leave-last-")
     try:
         if last != text:
-            return (1.0 if last == "out" else float(int(last)),)
+            return (1.0 if last == "out" else float(last),)
         if len(parts) == 3:
             return tuple(float(part) for part in parts)
         times = [datetime.fromisoformat(part.strip()) for part in parts]

@@ -90,9 +90,9 @@ class SequencePolicy(nn.Module, ABC):
     items_only: ClassVar[str] = ""
     """Name of a policy that recommends items and refuses vectors; empty for others."""
     literal: ClassVar[bool] = False
-    """Whether items are learned as vectors are: windows end at any step alike, so that the last
-    steps of a session are in few of them, and embeddings of places begin as large as those of
-    items."""
+    """Whether items, too, are learned as the paper says: all steps are equally likely to end a
+    window, which leaves the last ones of a session in few of them, and no initial value is that of
+    `begin_with_items`."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
@@ -29,6 +30,7 @@ from ucfrec.settings import require_ids, require_whole
 RANK = "rank"
 SCORE = "score"
 SIMILAR_ITEM = "similar_item_id"
+_LAST_MS = 2**48  # in the year 10889
 _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**23
@@ -128,8 +130,7 @@ def decide(
         histories = batch.with_numbers(trained.items, filter_seen)
         if not (skip_unknown or (histories.item_ids >= 0).all()):
             raise _refuse_unknown(trained.items, [batch, *remaining])
-        # The seed, the time (ms) of the user's last row, `at` and candidates: a replay draws the
-        # same.
+        # A replay of the same request draws the same.
         last = np.zeros(len(batch.users), dtype=np.int64)
         np.maximum.at(last, batch.owner, batch.timestamps)
         requests = np.asarray([f"{seed}-{ms}{told_apart}" for ms in last.tolist()], dtype=object)
@@ -170,13 +171,12 @@ def read_time(at: str | float | datetime | None) -> int | None:
     """Milliseconds since 1970 of the time of requests; InputError if it is no time."""
     if at is None:
         return None
-    try:
-        # What is no time is no valid text either.
-        written = at.isoformat() if isinstance(at, datetime) else at
-        is_number = isinstance(at, int | float) and not isinstance(at, bool)
-        return round(parse_time(written if is_number else str(written)))
-    except (ValueError, OverflowError):
-        raise InputError(f"the time of the requests is {at!r:.60}; {TIME_FORMS}") from None
+    written = at.isoformat() if isinstance(at, datetime) else at
+    with suppress(TypeError, ValueError, OverflowError):
+        time_ms = round(parse_time(written))
+        if abs(time_ms) < _LAST_MS and not isinstance(at, bool):
+            return time_ms
+    raise InputError(f"the time of the requests is {at!r:.60}; {TIME_FORMS}")
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 
 _Report = TypeVar("_Report")
+_REFERENCES = (("popularity", "by popularity"), ("uniform", "at random"))
 RUN = RUN_RECORD
 REFIT = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
@@ -254,12 +255,11 @@ class RunRecord(TrainingRecord):
         """
         best = math.nan if self.policy is None else self.policy.best_validation
         losses = self.reference_losses or {}
-        name = min(losses, key=losses.__getitem__, default="")
-        if not name or "action_loss" not in logged or not best >= losses[name]:
+        least, how = min((losses.get(name, math.inf), how) for name, how in _REFERENCES)
+        if "action_loss" not in logged or not best >= least:
             return ""
-        how = {"popularity": "by popularity", "uniform": "at random"}[name]
         return (
-            f"the best validation loss, {best:.4g}, is not below {losses[name]:.4g}, the loss of "
+            f"the best validation loss, {best:.4g}, is not below {least:.4g}, the loss of "
             f"showing items {how}: the policy learned nothing about users; add features of users "
             "and items or more history, train with more steps, or use --policy recent-clicks "
             "(expected where the log was drawn at random)"

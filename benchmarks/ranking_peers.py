@@ -43,7 +43,8 @@ def rank_with_rectools(folder: Path, seed: int) -> None:
     model.fit(Dataset.construct(rows))
     network, data = model.lightning_model.torch_model.eval(), model.data_preparator
     numbers = {film: n for n, film in enumerate(data.item_id_map.external_ids)}
-    history, gains = defaultdict(list), []
+    history: defaultdict[str, list[int]] = defaultdict(list)
+    gains: list[float] = []
     for user, film in zip(first.user, first.film, strict=True):
         # RecTools leaves out users of one film, and with them some films.
         history[user] += [numbers[film]] if film in numbers else []
@@ -79,9 +80,8 @@ def rank_with_ucfrec(folder: Path, seed: int, policy: str) -> tuple[list[float],
     if not store.exists():
         how = ("--reward", "rating", "--session-by", "user", "--split", "0.89,0.11,0")
         run(*ours, "prepare", log, "--out", store, *columns, *how)
-    options = ("--policy", policy, "--seed", str(seed), "--threads", "1", "--goal", "rank")
-    options += ("--set", "policy.dim=64")
-    _, seconds = run(*ours, "train", store, "--out", out, *options)
+    options = ["--policy", policy, "--seed", str(seed), "--threads", "1", "--goal", "rank"]
+    _, seconds = run(*ours, "train", store, "--out", out, *options, "--set", "policy.dim=64")
     run(*ours, "rank", out, folder / "later.csv", *columns, "--json", out.with_suffix(".json"))
     row = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))[0]
     share = row["conditions"]["steps"] / len(pd.read_csv(folder / "later.csv"))

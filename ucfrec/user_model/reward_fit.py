@@ -30,6 +30,8 @@ from ucfrec.user_model.reward_effects import (
     Beginning,
     Design,
     EffectSearch,
+    choose_half_life,
+    fade_rows,
     fit_effects,
 )
 from ucfrec.user_model.reward_report import (
@@ -87,7 +89,8 @@ def fit_item_reward_model(
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
-    than the standard error of the decrease.
+    than the standard error of the decrease. They also choose how much less older rows count, unless
+    running rates say what is recent.
 
     Where hardly any validation row is of a user with training rows, the model is for new users. A
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
@@ -109,7 +112,10 @@ def fit_item_reward_model(
     set_statistics(model, rows, held_out, train)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
-    search = EffectSearch(design, Design.of(model, held_out), begin)
+    later = Design.of(model, held_out)
+    half_life = choose_half_life(design, later, rows.times) if model.rates is None else None
+    design = replace(design, weights=fade_rows(rows.times, half_life))
+    search = EffectSearch(design, later, begin)
     if search.of_new_users:
         rows, held_out = (RewardRows.of(v, MEMORY, _MAX_ROWS, seed) for v in (train, validation))
         search.sessions = model, rows.history, held_out.history
@@ -128,11 +134,14 @@ def fit_item_reward_model(
             if name == CHEAP[-1] and not begin.effects:
                 lasting.adjust()
             bar.update()
+        if not begin.effects:
+            search.adjust()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
     report = ItemRewardReport(
         effects=search.report(),
         new_users=search.new_users,
+        half_life=half_life,
         base_loss=search.base_loss,
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),
@@ -155,7 +164,7 @@ def refit_item_reward_model(
     lags = MEMORY if "tastes" in report.kept else model.lags
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     set_statistics(model, rows, rows, store)
-    design = Design.of(model, rows)
+    design = Design.of(model, rows, fade_rows(rows.times, report.half_life))
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     if report.new_users:

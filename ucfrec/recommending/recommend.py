@@ -228,11 +228,12 @@ class Chooser:
             part = latest if len(order) == 1 else latest.of_users(users)
             without = excluded
             if any(allowed is not None for allowed in candidates):
-                without = torch.zeros(len(users), count, dtype=torch.bool)
+                left_out = np.zeros((len(users), count), dtype=bool)
                 for row, user in enumerate(users.tolist()):
                     if (allowed := candidates[user]) is not None:
-                        without[row] = True
-                        without[row, allowed] = False
+                        left_out[row] = True
+                        left_out[row, allowed] = False
+                without = torch.from_numpy(left_out)
             parts.append(self._choose_together(part, requests[users], min(k, count), without))
         back = np.argsort(order, kind="stable")
         items, scores, propensities = (

@@ -362,6 +362,6 @@ def _read_times(rows: Sequence[Row]) -> list[int]:
 
 def id_array(ids: Sequence[int | str]) -> Array:
     """Identifiers as int64 if all are integers, otherwise as text."""
-    if all(isinstance(value, int) for value in ids):
+    if {*map(type, ids)} <= {int}:
         return np.asarray(ids, dtype=np.int64)
     return np.asarray(list(map(str, ids)), dtype=object)

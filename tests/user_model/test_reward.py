@@ -184,8 +184,8 @@ def test_the_root_is_of_how_users_differ(users: int) -> None:
     spread = np.diag([0.1, 2.0, 1.0, 0.5])
     drawn = torch.from_numpy(rng.normal(size=(users, SIZE + 1)) @ spread).float()
     vectors = torch.from_numpy(rng.normal(size=(400, SIZE))).float()
-    root = root_of_tastes(drawn, vectors)
     inputs = F.pad(vectors, (1, 0), value=1.0)
+    root = root_of_tastes(drawn, inputs)
     assert float((inputs @ root).square().sum(1).mean()) == pytest.approx(1.0, rel=1e-4)
     if users == 500:
         variances, expected = (root @ root.T).diagonal(), torch.tensor([0.01, 4.0, 1.0, 0.25])
@@ -196,7 +196,7 @@ def test_the_root_is_of_how_users_differ(users: int) -> None:
 def test_users_who_differ_in_one_direction_have_a_root() -> None:
     drawn = torch.zeros(5000, SIZE + 1)
     drawn[:, 1] = torch.randn(5000, generator=torch.Generator().manual_seed(0))
-    root = root_of_tastes(drawn, torch.eye(SIZE))
+    root = root_of_tastes(drawn, F.pad(torch.eye(SIZE), (1, 0), value=1.0))
     assert torch.isfinite(root).all()
     assert float(root[1, 1]) > 30 * float(root[2, 2]) > 0
 

@@ -97,6 +97,30 @@ def test_planted_item_effects_are_recovered_and_calibrated(tmp_path: Path) -> No
     assert calibration_error(predicted, rows.rewards.double().numpy()) < 0.05
 
 
+def test_items_are_described_by_what_users_differ_in(tmp_path: Path) -> None:
+    rng, users = np.random.default_rng(0), 300
+    embeddings = np.random.default_rng(5).normal(size=(ITEMS, 16))
+    embeddings[:, 0] = np.arange(ITEMS) % 2 * 2 - 1
+    taste, items = rng.choice([-1.5, 1.5], users), rng.integers(ITEMS, size=(users, 2 * LENGTH))
+    liked = rng.random(items.shape) < sigmoid(taste[:, None] * embeddings[items, 0])
+    store = EpisodeStore.from_arrays(
+        {"item": items.ravel(), "reward": liked.ravel().astype(np.float64)},
+        np.full(2 * users, LENGTH),
+        {"user": np.repeat(np.arange(users), 2), "split": np.tile([0, 1], users)},
+        replace(item_states(users), embeddings=torch.from_numpy(embeddings).float()),
+    )
+    model, report = fit_item_reward_model(*views(store), tmp_path / "first", seed=0)
+    assert "affinity" in report.kept
+    lengths = model.turn.square().sum(1)
+    assert lengths[0] > 3 * lengths[1:].max()
+    known = np.corrcoef(model.affinity[:-1] @ model.turn[0], taste)[0, 1]
+    assert known > 0.9
+    again = refit_item_reward_model(tmp_path / "first", store.whole, tmp_path / "again", 0)
+    torch.testing.assert_close(again.turn, model.turn)
+    updated, _ = fit_item_reward_model(*views(store), tmp_path / "next", 0, tmp_path / "first")
+    torch.testing.assert_close(updated.vectors, model.vectors)
+
+
 @pytest.mark.parametrize("drifts", [True, False])
 def test_rows_of_before_the_items_changed_count_less(drifts: bool, tmp_path: Path) -> None:
     planted = log(0, users=800)

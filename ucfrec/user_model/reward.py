@@ -103,13 +103,13 @@ def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Te
 
 
 def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
-    """L (D + 1, D + 1) with L Lᵀ ∝ C, the covariance around 0 of the tastes (U, D + 1) of training
-    users, shrunk where they are few (Ledoit and Wolf, 2004), such that they add 1 to the variance
-    of scores of logged items with the vectors (M, D)."""
+    """L (D, D) with L Lᵀ ∝ C, the covariance around 0 of the tastes (U, D) of training users,
+    shrunk where they are few (Ledoit and Wolf, 2004), such that they add 1 to the variance of
+    scores of logged items with the vectors (M, D)."""
     from sklearn.covariance import ledoit_wolf
 
     covariance = torch.from_numpy(ledoit_wolf(tastes.double().numpy(), assume_centered=True)[0])
-    inputs = F.pad(vectors.double(), (1, 0), value=1.0)
+    inputs = vectors.double()
     variance = ((inputs @ covariance) * inputs).sum(1).mean()
     least = _LEAST * covariance.trace() / len(covariance) * torch.eye(len(covariance))
     root: Tensor = torch.linalg.cholesky((covariance + least) / variance)
@@ -123,9 +123,10 @@ class ItemRewardModel(nn.Module):
 
         η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i,
 
-    x being the standardised state, e_i the centred embedding of the item, and exposure_i what
-    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
-    new users, user_u and affinity_u are what the session shows of them (`UserPosterior`).
+    x being the standardised state, e_i the centred embedding of the item times a matrix `turn`,
+    after which users differ in all directions alike, and exposure_i what repeating an item, or
+    showing one like it, n steps after the last time adds (`Likeness`). For new users, user_u and
+    affinity_u are what the session shows of them (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     η is the log-odds of the higher of two rewards, otherwise the standardised reward.
     """
@@ -142,6 +143,7 @@ class ItemRewardModel(nn.Module):
         self.reward_mean = nn.Buffer(torch.zeros(()))
         self.state_mean = nn.Buffer(torch.zeros(state))
         self.vectors = nn.Buffer(torch.zeros(items, dim))
+        self.turn = nn.Buffer(torch.eye(dim))
         self.item = nn.Buffer(torch.zeros(items))
         self.user = nn.Buffer(torch.zeros(users))
         self.affinity = nn.Buffer(torch.zeros(users, dim))

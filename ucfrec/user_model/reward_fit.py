@@ -109,6 +109,7 @@ def fit_item_reward_model(
     if file.exists():
         return model, _read_fit(file, model, ItemRewardReport)
     rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
+    _take_turn(model, first, FITTED)
     set_statistics(model, rows, held_out, train)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
@@ -163,6 +164,7 @@ def refit_item_reward_model(
     model = ItemRewardModel(reward_model_sizes(store))
     lags = MEMORY if "tastes" in report.kept else model.lags
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
+    _take_turn(model, first, FITTED)
     set_statistics(model, rows, rows, store)
     design = Design.of(model, rows, fade_rows(rows.times, report.half_life))
     begin = Beginning.of(first, FITTED, design)
@@ -195,6 +197,7 @@ def fit_training_users(
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
+    _take_turn(model, first, _USERS_FITTED)
     set_statistics(model, rows, rows, train)
     # What the session shows of tastes is known already: states are features and observations.
     model.state_std[: states.size - states.user_features.shape[1]] = torch.inf
@@ -211,7 +214,7 @@ def fit_training_users(
     held_out = search.held_out
     scores = held_out.predictor(search.effects)
     line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
-    search.fit_to(design)
+    search.fit_to(design.turned(search.turn))
     report = TrainingUsersReport(line, search.report())
     search.save(file, model, report)
     return model, report
@@ -278,6 +281,7 @@ def set_statistics(
     exact = states.embeddings.double().sub_(mean)
     length = exact[rows.items].square_().sum(1).mean().sqrt()
     model.vectors.copy_(exact.div_(length.clamp(min=_CONSTANT)))
+    model.vectors.copy_(model.vectors @ model.turn)
     model.likeness.start_from(states)
     model.rates = RunningRates.of(train, model.target)
     if model.rates is not None:
@@ -291,6 +295,12 @@ def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]
     model.eval()
     with damage_explained(file, REMEDY):
         return report(**metadata)
+
+
+def _take_turn(model: ItemRewardModel, first: Path | None, name: str) -> None:
+    """Turn the vectors as an earlier fit in a folder did, if there is one."""
+    if first is not None and (first / name).exists():
+        model.turn.copy_(load_tensors(first / name)[0]["turn"])
 
 
 def _select_some(design: Design, seed: int) -> Design:

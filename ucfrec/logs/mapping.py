@@ -115,7 +115,9 @@ class LogMapping:
         names = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
         for name in self.columns:
             if name not in names:
-                raise InputError(f"{name!r} is not a log column; use one of {', '.join(names)}")
+                hint = "; write reward = ... above [columns]" if name == "reward" else ""
+                columns = ", ".join(names)
+                raise InputError(f"{name!r} is not a log column; use one of {columns}{hint}")
         if self.session_by not in (None, *SESSIONS):
             raise InputError(
                 f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}, and map a column "

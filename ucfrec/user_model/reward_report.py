@@ -15,7 +15,7 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward import PLACES, ItemRewardModel
 
 _BINS = 10
 _CHUNK = 16_384
@@ -42,8 +42,10 @@ class RewardRows:
     """(M,) float32, in reward units."""
     observations: int
     """O, the last numbers of the states: what was observed beside the session itself."""
-    offer: Offer | None = None
+    offer: Offer | None
     """What was on offer; None for everything."""
+    above: Tensor
+    """(M, P) int64 items above it in its own list, −1 for none; P is 0 where there are no lists."""
 
     def __len__(self) -> int:
         return len(self.items)
@@ -84,6 +86,7 @@ class RewardRows:
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
             view.offer(episodes, steps),
+            torch.from_numpy(view.items_above(episodes, steps, PLACES)),
         )
 
 
@@ -192,6 +195,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.users[part],
             rows.items[part],
             rows.offer and rows.offer.change(itemgetter(part)),
+            rows.above[part],
         )
         for part in torch.split(torch.arange(len(rows)), _CHUNK)
     ]

@@ -146,20 +146,21 @@ class _ManyRules(PolicyActor):
                 of_rule = query.at(slice(part.start - begin, part.stop - begin))
                 left_out = None if excluded is None else excluded[part]
                 scores = scorer.scores_of(of_rule, excluded=left_out)
-                decisions.append(self._choose(scorer.rule, scores, self._generators[number]))
+                decisions.append(self._choose(scorer, scores, self._generators[number]))
         return decisions
 
     def _choose(
         self,
-        rule: DecisionRule,
+        scorer: Scorer,
         scores: Tensor,
         generator: torch.Generator,
     ) -> tuple[Tensor, Tensor]:
+        rule, k = scorer.rule, min(self._length, self._n_items)
         if self._length == 1:
             items, chances = rule.choose(scores, generator)
             return items.unsqueeze(1), chances.unsqueeze(1)
         draws = torch.rand(len(scores), self._n_items + 1, generator=generator)
-        items, chances = rule.rank_items(scores, min(self._length, self._n_items), draws)
+        items, chances = rule.rank_items(scores, k, draws, scorer.list_term)
         return items, chances.float()
 
 

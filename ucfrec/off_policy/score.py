@@ -218,7 +218,7 @@ def score_steps(
                 scores, shared = scores[decision], torch.from_numpy(decision)
             else:
                 shared = torch.arange(len(first))
-            log_probabilities = scorer.rule.log_probabilities(scores, of_list)
+            log_probabilities = scorer.rule.log_probabilities(scores, of_list, scorer.list_term)
             row, place = torch.nonzero(of_list >= 0, as_tuple=True)
             scores[row, of_list[row, place]] = -torch.inf
             yield ScoredSteps(

@@ -255,8 +255,8 @@ class DecisionRule:
         for draws in torch.split(uniforms[:, :k].double(), 1, dim=1):
             modes = turns.next()
             sums = torch.where(explores, modes[-1], modes[0]).exp().cumsum(1)
-            drawn = draws.clamp(max=1 - 1e-9) * sums[:, -1:]
-            items = torch.searchsorted(sums, drawn, right=True)[:, 0]
+            levels = draws.clamp(max=1 - 1e-9) * sums[:, -1:]
+            items = torch.searchsorted(sums, levels, right=True)[:, 0]
             turns.add(items, modes)
             ranked.append(items)
             totals.append(turns.joint.logsumexp(0))
@@ -297,17 +297,17 @@ class _Turns:
         """(M, B, n_items) float64 log-probabilities of the next item, in each mode."""
         left = self._scores.masked_fill(self._taken, -torch.inf)
         # Once nothing that may be shown is left, the others follow, the lowest number first.
-        others = (_APART * torch.arange(left.shape[1])).masked_fill(self._taken, -torch.inf)
-        left = torch.where(left.amax(1, keepdim=True) > -torch.inf, left, others)
+        fallback = (_APART * torch.arange(left.shape[1])).masked_fill(self._taken, -torch.inf)
+        left = torch.where(left.amax(1, keepdim=True) > -torch.inf, left, fallback)
         return torch.stack([logs.double() for _, logs in self._rule._modes(left)])
 
     def add(self, items: Tensor, modes: Tensor) -> None:
         """Show items (B,) next, −1 for none, drawn from the log-probabilities of `next`."""
-        shown, column = (items >= 0).unsqueeze(1), items.clamp(min=0).unsqueeze(1)
+        valid, column = (items >= 0).unsqueeze(1), items.clamp(min=0).unsqueeze(1)
         logs = modes.gather(2, column.expand(len(modes), -1, 1))[:, :, 0]
-        self.joint = self.joint + logs.masked_fill(~shown[:, 0], 0.0)
-        self._scores = self._scores + self._term(column[:, 0]).masked_fill(~shown, 0.0)
-        self._taken = self._taken | torch.zeros_like(self._taken).scatter(1, column, shown)
+        self.joint = self.joint + logs.masked_fill(~valid[:, 0], 0.0)
+        self._scores = self._scores + self._term(column[:, 0]).masked_fill(~valid, 0.0)
+        self._taken = self._taken | torch.zeros_like(self._taken).scatter(1, column, valid)
 
 
 SavedRule = Annotated[

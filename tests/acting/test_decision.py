@@ -24,6 +24,7 @@ rules = st.builds(
     reward_weight=st.floats(0, 100),
     temperature=st.floats(0, 100),
     top_k=st.one_of(st.none(), st.integers(1, 99)),
+    by_marginal_gain=st.booleans(),
     exclude_seen=st.booleans(),
     tag_window=st.integers(0, 9),
     tag_run=st.integers(0, 10),
@@ -53,7 +54,7 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
     for same in (DecisionRule(np.float32(5)), DecisionRule(5, reward_weight=-0.0)):
         assert (same, same.hash) == (rule, rule.hash)
     whole = dict.fromkeys(("top_k", "tag_window", "tag_run", "explore_top"), 1)
-    values = whole | {"exclude_seen": True, "policy_weight": 0.5}
+    values = whole | {"exclude_seen": True, "by_marginal_gain": True, "policy_weight": 0.5}
     names = (field.name for field in fields(DecisionRule))
     others = [
         DecisionRule(**{"target": 5.0, "explore": 0.5, name: values.get(name, 1.0)})
@@ -170,6 +171,62 @@ def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(rule: Decisio
         if place < 4:
             of_items = chances.gather(1, items[:, place : place + 1])[:, 0]
             torch.testing.assert_close(of_items, propensities[:, place], atol=1e-6, rtol=1e-5)
+
+
+def repel(items: torch.Tensor) -> torch.Tensor:
+    """Items of the same parity as one above lose one and a half."""
+    return -1.5 * ((torch.arange(7) - items.unsqueeze(1)) % 2 == 0)
+
+
+IN_TURN = [
+    DecisionRule(0.0),
+    DecisionRule(0.0, temperature=0.7),
+    DecisionRule(0.0, temperature=0.7, top_k=3, explore=0.4),
+    DecisionRule(0.0, explore=0.3, explore_top=4),
+]
+
+
+@pytest.mark.parametrize("rule", IN_TURN, ids=str)
+def test_a_list_by_marginal_gain_is_drawn_item_by_item(rule: DecisionRule) -> None:
+    """Its probabilities are those of single draws under the scores that the items above leave."""
+    generator = torch.Generator().manual_seed(3)
+    scores = torch.randn(300, 7, generator=generator)
+    scores[torch.rand(300, 7, generator=generator) < 0.2] = -math.inf
+    uniforms = draws(scores, generator)
+    items, propensities = rule.rank_items(scores, 7, uniforms, repel)
+    assert (items.sort(1).values == torch.arange(7)).all()
+    single = [replace(rule, explore=0.0), replace(rule, explore=1.0)]
+    modes = torch.tensor([[1 - rule.explore], [rule.explore]]).log().double().expand(2, 300)
+    left = scores.clone()
+    for place in range(7):
+        earlier = torch.nn.functional.pad(items[:, :place], (0, 1), value=-1)
+        chances = rule.log_probabilities(scores, earlier, repel).double().exp()
+        torch.testing.assert_close(chances.sum(1), torch.ones(300).double(), atol=1e-5, rtol=0)
+        assert not chances.gather(1, items[:, :place]).any()
+        column = items[:, place : place + 1]
+        of_items = chances.gather(1, column)[:, 0]
+        torch.testing.assert_close(of_items, propensities[:, place], atol=1e-6, rtol=1e-4)
+        some = left.amax(1) > -math.inf
+        logs = torch.stack([each.log_probabilities(left[some]).double() for each in single])
+        posterior = modes[:, some].log_softmax(0).unsqueeze(2)
+        expected = (posterior + logs).logsumexp(0).exp()
+        torch.testing.assert_close(chances[some], expected, atol=1e-5, rtol=0)
+        modes = modes.clone()
+        modes[:, some] += logs.gather(2, column[some].expand(2, -1, 1))[:, :, 0]
+        left = (left + repel(items[:, place])).scatter(1, column, -math.inf)
+
+
+@pytest.mark.parametrize("rule", IN_TURN[1:], ids=str)
+def test_lists_by_marginal_gain_are_as_frequent_as_their_propensities(rule: DecisionRule) -> None:
+    n = 20_000
+    scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5, -math.inf, -math.inf]]).expand(n, -1)
+    uniforms = draws(scores, torch.Generator().manual_seed(2))
+    items, propensities = rule.rank_items(scores, 3, uniforms, repel)
+    lists, number, counts = items.unique(dim=0, return_inverse=True, return_counts=True)
+    stated = torch.zeros(len(lists), dtype=torch.float64)
+    stated[number] = propensities.prod(1)
+    assert float(stated.sum()) == pytest.approx(1, abs=1e-6)
+    assert chisquare(counts.numpy(), n * (stated / stated.sum()).numpy()).pvalue > 1e-3
 
 
 def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:

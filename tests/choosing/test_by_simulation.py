@@ -1,6 +1,7 @@
 """The decision rule is chosen on the log: finds what pays, keeps its conditions, says how."""
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -12,8 +13,10 @@ import torch
 
 from tests.support.logs import store_of
 from tests.support.tagged import tagged_store
+from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
+from ucfrec.arrays import Array, IntArray
 from ucfrec.choosing.by_simulation import (
     Outcomes,
     RuleSearch,
@@ -328,6 +331,57 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(trained: Tra
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}
     assert {each.policy_weight for each in rules if each.lookahead} == {0.0, 0.5, 1.0}
     assert sum(not each.lookahead for each in rules) == 1
+
+
+def listed_store(folder: Path) -> tuple[EpisodeStore, Callable[..., Array]]:
+    """Pages of four random items, of which one of a tag above makes others worth less; and the
+    chances of clicks of users (B,) on pages (B, 4)."""
+    rng, n_items, sessions, pages = np.random.default_rng(0), 36, 600, 3
+    quality, taste = rng.normal(0, 0.6, n_items), rng.normal(0, 1.2, (60, 4))
+
+    def chances(users: IntArray, items: IntArray) -> Array:
+        tags = items % 4
+        above = np.tril(tags[:, :, None] == tags[:, None], -1).sum(2)
+        odds = quality[items] + taste[users[:, None], tags] - 2 * above - 0.2 * np.arange(4)
+        return np.asarray(1 / (1 + np.exp(1 - odds)))
+
+    items = rng.permuted(np.tile(np.arange(n_items), (sessions, 1)), axis=1)[:, : 4 * pages]
+    items, users = items.reshape(-1, 4), np.repeat(np.arange(sessions) % 60, pages)
+    times = 10**12 + 10**7 * np.arange(sessions)[:, None] + 60_000 * np.arange(pages)
+    clicks = rng.random(items.shape) < chances(users, items)
+    columns = {"user_id": users, "timestamp": times.ravel(), "request_id": np.arange(len(users))}
+    log = pd.DataFrame({name: values.repeat(4) for name, values in columns.items()})
+    position = np.tile(np.arange(4), len(users))
+    log = log.assign(item_id=items.ravel(), position=position, reward=clicks.ravel() * 1.0)
+    tags = pd.DataFrame(
+        {"item_id": range(n_items), "tags": [[f"t{n % 4}"] for n in range(n_items)]}
+    )
+    tags.to_parquet(folder / "items.parquet")
+    mapping = LogMapping(item_features=(FeatureTable((folder / "items.parquet",), "item_id"),))
+    options = {"reward": "reward", "session_by": "gap", "gap_minutes": 60}
+    return store_of(log, folder, mapping, **options), chances
+
+
+def test_lists_are_built_by_marginal_gain_where_that_pays(tmp_path: Path) -> None:
+    store, chances = listed_store(tmp_path)
+    smaller = ["train.steps=20", "rule.sessions=60", "rule.tag_windows=[0]", "rule.lookaheads=[0]"]
+    smaller += ["rule.quantiles=[1.0]", "rule.temperatures=[0.0]", "rule.reward_weights=[0,2,4]"]
+    policy = Recommender("bc", settings=[*SETTINGS, *smaller]).fit(store, tmp_path / "run")
+    rule, model = policy.trained.rule, policy.trained.reward_model
+    assert rule.by_marginal_gain
+    assert model is not None
+    assert float(model.above) < -0.5
+    log, clicks = pd.read_parquet(tmp_path / "log.parquet"), {}
+    for by_gain in (True, False):
+        lists = policy.recommend(
+            log, 4, rule=replace(rule, by_marginal_gain=by_gain), filter_seen=False
+        )
+        users, items = (lists[name].to_numpy().reshape(-1, 4) for name in ("user_id", "item_id"))
+        clicks[by_gain] = float(chances(users[:, 0], items).sum(1).mean())
+    assert clicks[True] > 1.1 * clicks[False]
+    scorer, users_model = policy.trained.scorer(rule), users_of(tmp_path / "run", store)
+    problem = Problem(scorer, users_model, {}, *training_views(store), FEW, 0)
+    assert replace(rule, by_marginal_gain=False) in [*find_neighbours(rule, problem)]
 
 
 def tiring_store(folder: Path) -> EpisodeStore:

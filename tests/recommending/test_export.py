@@ -243,6 +243,16 @@ def test_a_lookahead_over_items_that_come_and_go_is_refused(ending: TrainedPolic
         compile_scores(scorer, "ucf")
 
 
+def test_lists_by_marginal_gain_are_not_exported(ending: TrainedPolicy, tmp_path: Path) -> None:
+    rule = replace(AHEAD, by_marginal_gain=True)
+    with pytest.raises(InputError, match=r"marginal gain, and has lookahead .* set the lookahead"):
+        export(ending, tmp_path / "out", rule=rule)
+    model = copy.deepcopy(ending.reward_model)
+    model.above.fill_(-1.0)
+    with pytest.raises(InputError, match=r"marginal gain, which a graph cannot; use `ucfrec serve"):
+        export(replace(ending, reward_model=model), tmp_path, rule=replace(rule, lookahead=0.0))
+
+
 @pytest.mark.slow
 def test_answers_are_those_of_torch(
     ending: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch

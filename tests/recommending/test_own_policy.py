@@ -1,5 +1,6 @@
 """A policy evaluated on a log of its own decisions: every weight is 1."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,18 @@ PAUSES = {"a session goes on": 60_000, "a session begins": 7_200_000}
 @pytest.mark.parametrize("filter_seen", [False, True])
 @pytest.mark.parametrize("pause", PAUSES.values(), ids=PAUSES)
 @pytest.mark.parametrize("among", [None, range(0, 24, 2)], ids=["all", "candidates"])
+@pytest.mark.parametrize("in_turn", [False, True])
 def test_weights_are_one(
-    tmp_path: Path, k: int, filter_seen: bool, pause: int, among: range | None
+    tmp_path: Path, k: int, filter_seen: bool, pause: int, among: range | None, in_turn: bool
 ) -> None:
     trained, log = trained_run(tmp_path), tagged_log()
     policy, rng = Recommender.load(tmp_path / "run"), np.random.default_rng(0)
     rule = DecisionRule(trained.rule.target, reward_weight=0.5, temperature=1.0)
+    if in_turn:
+        rule = replace(rule, explore=0.2, by_marginal_gain=True)
+        for model in (trained.reward_model, policy.trained.reward_model):
+            assert model is not None
+            model.above.fill_(-2.0)
     days = range(1 if among and filter_seen else 2)  # then all candidates are seen
     for day in days:
         shown, feedback = tmp_path / f"{day}.parquet", tmp_path / f"f{day}.parquet"

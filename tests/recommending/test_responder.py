@@ -5,6 +5,7 @@ import threading
 import time
 from collections import Counter
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +60,18 @@ def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: obje
 
 @pytest.mark.parametrize(
     "rule",
-    [None, FULL, DecisionRule(3.0, temperature=0.7, top_k=9, explore=0.5, explore_top=12)],
-    ids=["own", "full", "drawn"],
+    [
+        *(None, FULL, replace(FULL, by_marginal_gain=True)),
+        DecisionRule(3.0, temperature=0.7, top_k=9, explore=0.5, explore_top=12),
+    ],
+    ids=["own", "full", "in turn", "drawn"],
 )
 @pytest.mark.parametrize("keep_seen", [False, True])
 def test_answers_are_those_of_recommend(
     trained: TrainedPolicy, rule: DecisionRule | None, keep_seen: bool
 ) -> None:
+    assert trained.reward_model is not None
+    trained.reward_model.above.fill_(-1.0)
     log = histories()
     named = {"rule": rule, "filter_seen": not keep_seen}
     expected = recommended(trained, log, 24, **named)

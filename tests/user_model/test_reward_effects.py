@@ -36,6 +36,8 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         weights=torch.ones(rows),
         running=torch.from_numpy(rng.normal(size=(rows, 2))).float(),
         tastes=torch.from_numpy(rng.normal(size=rows)).float(),
+        position=torch.eye(4)[rng.integers(4, size=rows), 1:],
+        above=torch.from_numpy(rng.integers(3, size=(rows, 1))).float(),
     )
 
 
@@ -55,6 +57,8 @@ def matrix(given: Design, name: str) -> sparse.csr_matrix:
         "tastes": given.tastes.unsqueeze(1),
         "exposure": given.exposure,
         "running": given.running,
+        "position": given.position,
+        "above": given.above,
         "context": times_vectors(given.observed),
         "state": given.x,
         "interaction": times_vectors(given.x),

@@ -57,9 +57,15 @@ def store_of(log: Log, rewards: Float64Array, validation: float = 0.25) -> Episo
 
 
 def written(
-    log: Log, rewards: Float64Array, users: IntArray, split: IntArray, **changes: Any
+    log: Log,
+    rewards: Float64Array,
+    users: IntArray,
+    split: IntArray,
+    more: dict[str, IntArray] | None = None,
+    **changes: Any,
 ) -> EpisodeStore:
     columns, lengths = {"item": log.items, "reward": rewards}, np.full(len(users), LENGTH)
+    columns |= more or {}
     states = replace(item_states(len(users)), **changes)
     return EpisodeStore.from_arrays(columns, lengths, {"user": users, "split": split}, states)
 
@@ -151,6 +157,34 @@ def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
     assert model.exposure[1, 0] < -1
     assert model.exposure[1, 1:].abs().max() < 0.5
     assert report.loss < report.item_loss
+
+
+@pytest.mark.parametrize("by_tags", [True, False])
+def test_effects_of_lists_are_learned_where_there_are_lists(tmp_path: Path, by_tags: bool) -> None:
+    """Lists of five: later places are worth less, and items like those above them."""
+    planted, places = log(2, users=400), {"place": np.tile(np.arange(5), 400 * LENGTH // 5)}
+    tags, odds = (planted.items % TAGS).reshape(-1, 5), planted.predictor.reshape(-1, 5)
+    above = np.tril(tags[:, :, None] == tags[:, None], -1).sum(2)
+    odds -= 0.4 * np.arange(5) + 0.8 * above
+    changes: dict[str, Any] = {} if by_tags else {"tags": torch.zeros(ITEMS, 0, dtype=torch.int64)}
+    changes["embeddings"] = torch.eye(TAGS)[torch.arange(ITEMS) % TAGS]
+    users, split = np.arange(400), (np.arange(400) >= 300).astype(np.int64)
+    store = written(planted, clicks(planted), users, split, places, **changes)
+    model, report = fit_item_reward_model(*views(store), tmp_path / "lists", seed=0)
+    assert {"position", "above"} <= report.kept.keys()
+    effects = torch.cat([model.above, model.position[:4]])
+    np.testing.assert_allclose(effects.numpy(), [-0.8, -0.4, -0.8, -1.2, -1.6], atol=0.25)
+    rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
+    # Scores of all items, by which rules decide, are those of the top.
+    top, given = rows.above[:, 0] < 0, (rows.states, rows.history, rows.users)
+    every = model.scores(*given).gather(1, rows.items.unsqueeze(1))[:, 0]
+    apart = score_rows(model, rows) - every
+    torch.testing.assert_close(apart[top], torch.zeros(int(top.sum())), atol=1e-4, rtol=0)
+    assert float(apart[~top].mean()) < -0.5
+    # One row a decision: nothing is tried.
+    store = written(planted, clicks(planted), users, split, **changes)
+    model, report = fit_item_reward_model(*views(store), tmp_path / "items", seed=0)
+    assert not {"position", "above"} & {effect.effect for effect in report.effects}
 
 
 @pytest.mark.parametrize("known", [True, False])

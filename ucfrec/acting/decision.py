@@ -1,7 +1,7 @@
 """The decision rule: what turns a trained policy into what is shown, the same wherever it acts."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Self
 
@@ -19,8 +19,12 @@ from ucfrec.settings import Share, Weight, settings_table
 
 _Return = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Items = Annotated[int, Field(ge=1, le=10**9)]
+ListTerm = Callable[[Tensor], Tensor]
+"""What items (B,) of lists add to the scores (B, n_items) of those below them."""
 _COLDEST = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
+_APART = -1e9
+"""Difference of scores where the lower one is never drawn."""
 _LAST = -1e40
 """Log-probability below those of float32: of items that are drawn once no others are left."""
 _FEW = 2**16
@@ -60,6 +64,9 @@ class DecisionRule:
     """T; items are drawn, or, at 0, the best is taken."""
     top_k: _Items | None = None
     """Only this number of best items are drawn from; None for all."""
+    by_marginal_gain: bool = False
+    """Whether lists are built item by item, by what each adds to those above it, as the reward
+    model says: f̂_r then counts how alike they are."""
     exclude_seen: bool = False
     """Whether items that the session has shown are excluded."""
     tag_window: Annotated[int, Field(ge=0, le=10**4)] = 0
@@ -104,6 +111,7 @@ class DecisionRule:
             f"lookahead {self.lookahead:g}": self.lookahead,
             f"policy weight {effect}": self.policy_weight != 1,
             f"the {self.top_k} best": self.top_k,
+            "lists by marginal gain": self.by_marginal_gain,
             "unseen items": self.exclude_seen,
             f"no tag of the last {self.tag_window}": self.tag_window,
             f"no main tag liked more than {self.tag_run} times in a row": self.tag_run,
@@ -132,14 +140,26 @@ class DecisionRule:
         targets = returns.target_returns(self.target, collected)
         return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 
-    def log_probabilities(self, scores: Tensor, earlier: Tensor | None = None) -> Tensor:
+    def log_probabilities(
+        self,
+        scores: Tensor,
+        earlier: Tensor | None = None,
+        term: ListTerm | None = None,
+    ) -> Tensor:
         """Log-probabilities (nats) with which items are shown next in a list, (B, n_items).
 
         Args:
             scores: (B, n_items) of `Scorer.scores`.
             earlier: (B, P) int64 different items at the positions before, −1 for none; None for
                 those of a first position.
+            term: `Scorer.list_term`.
         """
+        if term is not None and earlier is not None:
+            turns = _Turns(self, scores, term)
+            for items in earlier.unbind(1):
+                turns.add(items, turns.next())
+            joint = turns.joint.log_softmax(0).nan_to_num(nan=0.0, neginf=-torch.inf)
+            return (joint.unsqueeze(2) + turns.next()).logsumexp(0).log_softmax(1).float()
         modes = self._modes(scores)
         if earlier is None or not earlier.shape[1]:
             first, *second = (logs.add_(math.log(share)) for share, logs in modes)
@@ -183,6 +203,7 @@ class DecisionRule:
         scores: Tensor,
         k: int,
         uniforms: Tensor | None,
+        term: ListTerm | None = None,
     ) -> tuple[Tensor, Tensor]:
         """`k` different items (B, k) in the order shown, best first or drawn one after the other,
         and their propensities (B, k) float64.
@@ -194,7 +215,10 @@ class DecisionRule:
             scores: (B, n_items) of `Scorer.scores`; k at most n_items.
             uniforms: (B, n_items + 1) draws from [0, 1), needed if the rule `draws`; the last
                 decides whether a request explores.
+            term: `Scorer.list_term`; each item is then drawn as the first would be of what is left.
         """
+        if term is not None:
+            return self._rank_in_turn(scores, k, uniforms, term)
         if not self.draws:
             return best_items(scores, k), torch.ones(len(scores), k, dtype=torch.float64)
         assert uniforms is not None
@@ -216,6 +240,28 @@ class DecisionRule:
         joint = torch.logaddexp(exploiting, exploring)
         return items, joint.diff(dim=1, prepend=start).exp()
 
+    def _rank_in_turn(
+        self,
+        scores: Tensor,
+        k: int,
+        uniforms: Tensor | None,
+        term: ListTerm,
+    ) -> tuple[Tensor, Tensor]:
+        """`rank_items` by scores that change from item to item."""
+        if uniforms is None:
+            uniforms = scores.new_zeros(len(scores), scores.shape[1] + 1)
+        turns, explores = _Turns(self, scores, term), uniforms[:, -1:] < self.explore
+        ranked, totals = list[Tensor](), [turns.joint.logsumexp(0)]
+        for draws in torch.split(uniforms[:, :k].double(), 1, dim=1):
+            modes = turns.next()
+            sums = torch.where(explores, modes[-1], modes[0]).exp().cumsum(1)
+            levels = draws.clamp(max=1 - 1e-9) * sums[:, -1:]
+            items = torch.searchsorted(sums, levels, right=True)[:, 0]
+            turns.add(items, modes)
+            ranked.append(items)
+            totals.append(turns.joint.logsumexp(0))
+        return torch.stack(ranked, 1), torch.stack(totals, 1).diff(dim=1).exp().clamp(max=1.0)
+
     def _modes(self, scores: Tensor) -> list[tuple[float, Tensor]]:
         """Ways in which a request may be answered: its share, and log-probabilities (B, n_items) of
         the first item."""
@@ -235,6 +281,33 @@ class DecisionRule:
             even = torch.zeros_like(allowed).masked_fill(torch.isneginf(allowed), -torch.inf)
             modes.append((self.explore, even.log_softmax(-1)))
         return modes
+
+
+class _Turns:
+    """Lists of B requests that are built item by item, by scores that change with each."""
+
+    def __init__(self, rule: DecisionRule, scores: Tensor, term: ListTerm) -> None:
+        self._rule, self._scores, self._term = rule, scores, term
+        self._taken = torch.zeros_like(scores, dtype=torch.bool)
+        shares = [share for share in (1 - rule.explore, rule.explore) if share > 0]
+        self.joint = torch.tensor(shares).double().log().unsqueeze(1).expand(-1, len(scores))
+        """(M, B) log-probabilities of the items so far, and of being answered in each mode."""
+
+    def next(self) -> Tensor:
+        """(M, B, n_items) float64 log-probabilities of the next item, in each mode."""
+        left = self._scores.masked_fill(self._taken, -torch.inf)
+        # Once nothing that may be shown is left, the others follow, the lowest number first.
+        fallback = (_APART * torch.arange(left.shape[1])).masked_fill(self._taken, -torch.inf)
+        left = torch.where(left.amax(1, keepdim=True) > -torch.inf, left, fallback)
+        return torch.stack([logs.double() for _, logs in self._rule._modes(left)])
+
+    def add(self, items: Tensor, modes: Tensor) -> None:
+        """Show items (B,) next, −1 for none, drawn from the log-probabilities of `next`."""
+        valid, column = (items >= 0).unsqueeze(1), items.clamp(min=0).unsqueeze(1)
+        logs = modes.gather(2, column.expand(len(modes), -1, 1))[:, :, 0]
+        self.joint = self.joint + logs.masked_fill(~valid[:, 0], 0.0)
+        self._scores = self._scores + self._term(column[:, 0]).masked_fill(~valid, 0.0)
+        self._taken = self._taken | torch.zeros_like(self._taken).scatter(1, column, valid)
 
 
 SavedRule = Annotated[

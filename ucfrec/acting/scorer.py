@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.acting.decision import DecisionRule, best_items
+from ucfrec.acting.decision import DecisionRule, ListTerm, best_items
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_table import WINDOW
@@ -135,6 +135,11 @@ class Scorer:
                 f"the rule has lookahead {rule.lookahead:g}, but the run has no model of session "
                 "ends; train it on a log with sessions, or set the lookahead to 0"
             )
+        if rule.by_marginal_gain and rule.looks_ahead:
+            raise InputError(
+                f"the rule builds lists by marginal gain, and has lookahead {rule.lookahead:g}, "
+                "which counts single items; set the lookahead to 0, or by_marginal_gain to false"
+            )
         for name, value in (("tag window", rule.tag_window), ("tag run", rule.tag_run)):
             if value and (tags is None or not bool((tags >= 0).any())):
                 raise InputError(
@@ -174,11 +179,25 @@ class Scorer:
     def is_product(self) -> bool:
         """Whether the scores are a product with vectors of the items, but for tags and repetition:
         of a policy that has factors, under a rule without lookahead or policy weight."""
-        return self.has_factors and self._is_plain
+        return self.has_factors and self._is_plain and self.list_term is None
 
     @property
     def _is_plain(self) -> bool:
         return self.rule.policy_weight == 1 and not self.rule.looks_ahead
+
+    @property
+    def list_term(self) -> ListTerm | None:
+        """What items of a list add to the scores of those below them; None for nothing."""
+        model, weight = self.reward_model, self.rule.reward_weight
+        if not (self.rule.by_marginal_gain and weight and model is not None and model.above.any()):
+            return None
+
+        def add(items: Tensor) -> Tensor:
+            weights = weight * model.above.expand(len(items), 1)
+            profile = model.likeness.profile(items.unsqueeze(1), weights)
+            return model.likeness.added_to(torch.zeros(len(items), self._items.count), profile)
+
+        return add
 
     def vectors(self) -> Float32Array:
         """(n_items, d + 1) vectors of all items, the last column a bias; their products with the

@@ -146,20 +146,21 @@ class _ManyRules(PolicyActor):
                 of_rule = query.at(slice(part.start - begin, part.stop - begin))
                 left_out = None if excluded is None else excluded[part]
                 scores = scorer.scores_of(of_rule, excluded=left_out)
-                decisions.append(self._choose(scorer.rule, scores, self._generators[number]))
+                decisions.append(self._choose(scorer, scores, self._generators[number]))
         return decisions
 
     def _choose(
         self,
-        rule: DecisionRule,
+        scorer: Scorer,
         scores: Tensor,
         generator: torch.Generator,
     ) -> tuple[Tensor, Tensor]:
+        rule, k = scorer.rule, min(self._length, self._n_items)
         if self._length == 1:
             items, chances = rule.choose(scores, generator)
             return items.unsqueeze(1), chances.unsqueeze(1)
         draws = torch.rand(len(scores), self._n_items + 1, generator=generator)
-        items, chances = rule.rank_items(scores, min(self._length, self._n_items), draws)
+        items, chances = rule.rank_items(scores, k, draws, scorer.list_term)
         return items, chances.float()
 
 
@@ -482,6 +483,9 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
         # More than randomness ends sessions.
         grid = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
         candidates += search.simulate(_vary(second, lookahead=_lookaheads(problem), **grid))
+    if _knows_lists(problem):
+        by_gain = replace(second, by_marginal_gain=True, reward_weight=0.0)
+        candidates += search.simulate(_vary(by_gain, reward_weight=config.reward_weights))
     if problem.validation.item_states.tags.shape[1]:
         longest, temperatures = problem.scorer.known, config.temperatures
         windows = [window for window in config.tag_windows if 0 < window <= longest]
@@ -545,12 +549,19 @@ def _lookaheads(problem: Problem) -> list[float]:
     return [value for factor in problem.config.lookaheads if (value := factor * mean) > 0]
 
 
+def _knows_lists(problem: Problem) -> bool:
+    """Whether decisions are lists, whose items are known to be worth less, or more, below others
+    like them."""
+    return problem.train.usual_list() > 1 and bool(problem.users.reward.above.any())
+
+
 def find_neighbours(
     rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
 ) -> Iterator[DecisionRule]:
     """The rule, those of `_vary_target`, and those with another of its numbers one candidate up or
     down, of the configuration and `more`. A rule without lookahead also gets one, with the middle
-    weight of the policy; one with it loses it, with the middle reward weight."""
+    weight of the policy; one with it loses it, with the middle reward weight. One without it also
+    builds lists the other way, if the log shows what that is worth."""
     config = problem.config
     yield rule
     yield from _vary_target(rule, problem)
@@ -569,7 +580,10 @@ def find_neighbours(
     elif problem.users.session_end_report.kept != "constant":
         middle = median_high(config.policy_weights)
         for ahead, weight in product(_lookaheads(problem), config.lookahead_weights):
-            yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
+            plain = replace(rule, by_marginal_gain=False, policy_weight=middle)
+            yield replace(plain, lookahead=ahead, reward_weight=weight)
+    if not rule.looks_ahead and _knows_lists(problem):
+        grid["by_marginal_gain"] = [False, True]
     if problem.validation.item_states.tags.shape[1]:
         longest = problem.scorer.known
         grid["tag_window"] = [0, *(steps for steps in config.tag_windows if steps <= longest)]
@@ -584,7 +598,8 @@ def find_neighbours(
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     rule = candidate.rule
     return (
-        *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
+        *(rule.by_marginal_gain, rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0),
+        -rule.temperature,
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
 

@@ -154,6 +154,7 @@ class RuleOptions(Table):
     top_k: int | None = None
     explore: float | None = None
     explore_top: int | None = None
+    by_marginal_gain: bool = False
     exclude_seen: bool = False
     tag_window: int | None = None
     tag_run: int | None = None

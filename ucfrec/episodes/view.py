@@ -424,6 +424,22 @@ class EpisodeView:
         # A split may cut a decision whose rows have several times.
         return np.maximum(steps - self.step_values(schema.PLACE, episodes, steps), 0)
 
+    def items_above(
+        self,
+        episodes: IntArray,
+        steps: IntArray,
+        most: int | None = None,
+    ) -> IntArray:
+        """(B, P) items of the rows before steps (B,) in their own decisions, −1 where there are
+        fewer: the first P = `most`, or all; P is 0 where decisions have one row."""
+        if schema.PLACE not in self.record.columns:
+            return np.zeros((len(steps), 0), dtype=np.int64)
+        starts = self.decision_starts(episodes, steps)
+        count = int((steps - starts).max(initial=0)) if most is None else most
+        rows, last = starts[:, None] + np.arange(count), steps[:, None]
+        items = self.step_values(schema.ITEM, episodes[:, None], np.minimum(rows, last))
+        return np.where(rows < last, items, -1).astype(np.int64)
+
     def usual_list(self) -> int:
         """Mean number of rows of a decision, in whole rows; 1 or more."""
         if schema.PLACE not in self.record.columns:

@@ -213,12 +213,12 @@ def score_steps(
                 excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
             scores = scorer.scores_of(query, excluded, earlier)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-            of_list = _list_positions(store, episodes, starts, steps)
+            of_list = torch.from_numpy(store.items_above(episodes, steps))
             if of_list.shape[1]:
                 scores, shared = scores[decision], torch.from_numpy(decision)
             else:
                 shared = torch.arange(len(first))
-            log_probabilities = scorer.rule.log_probabilities(scores, of_list)
+            log_probabilities = scorer.rule.log_probabilities(scores, of_list, scorer.list_term)
             row, place = torch.nonzero(of_list >= 0, as_tuple=True)
             scores[row, of_list[row, place]] = -torch.inf
             yield ScoredSteps(
@@ -232,19 +232,6 @@ def score_steps(
                 None if query.features is None else query.features[shared],
             )
             bar.update(len(steps))
-
-
-def _list_positions(
-    store: EpisodeStore,
-    episodes: IntArray,
-    starts: IntArray,
-    steps: IntArray,
-) -> Tensor:
-    """(B, P) int64 known items at the positions before steps (B,) in decisions that begin with
-    `starts` (B,); −1 where there are fewer."""
-    places = starts[:, None] + np.arange(int((steps - starts).max(initial=0)))
-    items = store.step_values(schema.ITEM, episodes[:, None], places.clip(max=steps[:, None]))
-    return torch.from_numpy(np.where(places < steps[:, None], items, -1).astype(np.int64))
 
 
 def score(

@@ -59,8 +59,8 @@ _NOTES = (
     "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
     "and tag_run; put into `excluded` what is not available and, with exclude_seen, the session's "
     "items; with a temperature, draw from `scores` divided by it, with top_k among so many best; "
-    "with explore, draw that "
-    "share of the requests uniformly, with explore_top among so many best"
+    "with explore, draw that share of the requests uniformly, with explore_top among so many best; "
+    "by_marginal_gain changes nothing, as the reward model has no effect of items above others"
 )
 _SERVE = "use `ucfrec serve` or `recommend --stream`"
 _TORCH = "use --engine torch"
@@ -97,6 +97,11 @@ def export(
     require_installed()
     graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
     model = graph.scorer.reward_model
+    if graph.scorer.list_term is not None:
+        raise InputError(
+            f"{trained.folder}: the rule builds lists by marginal gain, which a graph cannot; "
+            f"{_SERVE}, or export a rule without"
+        )
     if graph.scorer.rule.reward_weight and model is not None and model.running.any():
         raise InputError(
             f"{trained.folder}: scores depend on the time of the request, as items come and go; "

@@ -276,7 +276,7 @@ class Chooser:
             none = torch.isneginf(highest)
             if none.any():
                 scores[none[:, 0]] = highest[none] = 0.0
-            items, propensities = rule.rank_items(scores, k, draws)
+            items, propensities = rule.rank_items(scores, k, draws, self.scorer.list_term)
             values = scores.gather(1, items)
             # In place, as memory for another copy of the scores takes longer than their sums.
             # Exponentials that underflow take long; what is lower adds nothing to a sum from 1 on.

@@ -135,9 +135,11 @@ class UserModel:
         users: Tensor | None,
         items: Tensor,
         offer: Offer | None = None,
+        above: Tensor | None = None,
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
-        scores = self.rewarding.score(states, history, users, items, offer)
+        """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,); see
+        `ItemRewardModel.score`."""
+        scores = self.rewarding.score(states, history, users, items, offer, above)
         return self._expect_of(scores, history)
 
     def expect_unseen(self, sessions: EpisodeStore) -> Float64Array:
@@ -250,9 +252,10 @@ class UserSimulator:
             observations = torch.from_numpy(self.observations())
             states = self._sessions.latest_states(self._store.item_states, observations)
             self._before = states, history
+        above = self._sessions.shown.latest(self._place).items
         self._place = (self._place + 1) % self._length
         steps = self._sessions.steps.numpy()
-        self.expected = self._model.expect(*self._before, users, items, self.offer)
+        self.expected = self._model.expect(*self._before, users, items, self.offer, above)
         rewards = self._logged.draw(self.expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
         self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))

@@ -20,6 +20,9 @@ FITTED = "item_reward.safetensors"
 """File of a fitted model in its folder."""
 LAGS = 10
 """Items shown before a step whose repetition and likeness enter its expected reward."""
+PLACES = 15
+"""Places of a list after the first that have an effect of their own; later ones are like the last.
+Also the items of a list whose likeness to those below them counts."""
 _AT_ONCE = 8192
 """Items that are compared to what was shown before them at once."""
 CLIP = 5.0
@@ -102,6 +105,14 @@ def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Te
     return torch.cat(parts)
 
 
+def list_inputs(likeness: Likeness, above: Tensor, items: Tensor) -> tuple[Tensor, Tensor]:
+    """What the effects of lists multiply, for items (M,) below others (M, P), −1 for none: which
+    place it is, (M, `PLACES`), and the summed likeness to these, (M, 1)."""
+    place = (above >= 0).sum(1).clamp(max=PLACES)
+    alike = compare_to_history(likeness, above[:, :PLACES], items).sum(1, keepdim=True)
+    return F.one_hot(place, PLACES + 1)[:, 1:].float(), alike
+
+
 def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
     """L (D, D) with L Lᵀ ∝ C, the covariance around 0 of the tastes (U, D) of training users,
     shrunk where they are few (Ledoit and Wolf, 2004), such that they add 1 to the variance of
@@ -121,12 +132,14 @@ class ItemRewardModel(nn.Module):
 
     The linear predictor is
 
-        η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i,
+        η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i + list_i,
 
     x being the standardised state, e_i the centred embedding of the item times a matrix `turn`,
     after which users differ in all directions alike, and exposure_i what repeating an item, or
-    showing one like it, n steps after the last time adds (`Likeness`). For new users, user_u and
-    affinity_u are what the session shows of them (`UserPosterior`).
+    showing one like it, n steps after the last time adds (`Likeness`). list_i is 0 at the top of a
+    list; below, it is the effect of the place, and of the likeness to the items above, summed:
+    `scores` are of the top, so that places change no choice. For new users, user_u and affinity_u
+    are what the session shows of them (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     η is the log-odds of the higher of two rewards, otherwise the standardised reward.
     """
@@ -158,6 +171,8 @@ class ItemRewardModel(nn.Module):
         self.latest = nn.Buffer(torch.zeros(max(0, len(self.running) - AGES), items))
         self.rates: RunningRates | None = None
         """As of every time of a store; None for the `latest`."""
+        self.position = nn.Buffer(torch.zeros(PLACES))
+        self.above = nn.Buffer(torch.zeros(1))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
 
@@ -205,12 +220,16 @@ class ItemRewardModel(nn.Module):
         users: Tensor | None,
         items: Tensor,
         offer: Offer | None = None,
+        above: Tensor | None = None,
     ) -> Tensor:
-        """Linear predictors (B,) of one item each, int64 (B,), at the times of `offer`; see
-        `scores`."""
+        """Linear predictors (B,) of one item each, int64 (B,), at the times of `offer`, below
+        items (B, P) of the same list, −1 for none; see `scores`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
         added = added + self.sum_running(offer, items)
+        if above is not None:
+            position, alike = list_inputs(self.likeness, above, items)
+            added = added + position @ self.position + alike @ self.above
         earlier, repeated, alike = self.exposures(history)
         column, user_rows = items.unsqueeze(1), self._user_rows(users, items)
         exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), column)
@@ -263,7 +282,8 @@ class ItemRewardModel(nn.Module):
     ) -> None:
         """Set the fitted effects, those of `EFFECTS` by name; missing ones become 0, and effects of
         content those (n_items,) of the items' tags and embeddings."""
-        for name in ("user", "affinity", "state", "interaction", "exposure", "running"):
+        of_rows = ("state", "interaction", "exposure", "running", "position", "above")
+        for name in ("user", "affinity", *of_rows):
             buffer = self.get_buffer(name)
             buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
         if "context" in effects:

@@ -15,13 +15,18 @@ from torch.nn import functional as F
 from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
-from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
+from ucfrec.user_model.reward import (
+    ItemRewardModel,
+    compare_to_history,
+    list_inputs,
+    root_of_tastes,
+)
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 from ucfrec.user_model.running import HALF_LIVES_OF_DEMAND, HOUR_MS
 
 EFFECTS = (
-    *("running", "item", "user", "content", "affinity", "tastes", "exposure"),
-    *("context", "state", "interaction"),
+    *("running", "item", "user", "content", "affinity", "position", "above"),
+    *("tastes", "exposure", "context", "state", "interaction"),
 )
 """In the order in which they are added to the model."""
 _ITERATIONS = 100
@@ -45,10 +50,12 @@ _LEAST_KNOWN = 0.1
 """Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
-LASTING = ("running", "item", "user", "content", "affinity")
+LASTING = ("running", "item", "user", "content", "affinity", "position", "above")
 """Effects that are distinguished by users who were shown several items."""
-_ITEMS = ("running", "item", "content")
-"""Effects of items alone."""
+_FIXED = ("running", "item", "content", "position", "above")
+"""Those of items and of lists, which stay as they are where users are forgotten."""
+_SHARED = ("exposure", "running", "state", "position", "above")
+"""Effects of numbers of a row, whatever its item."""
 _OF_VECTORS = ("content", "affinity")
 """Effects of items' vectors that are found before these are turned."""
 _TURNS = 8
@@ -87,6 +94,9 @@ class Design:
     """(M,) how many rows each row counts for."""
     running: Tensor
     """(M, R) inputs of `RunningRates`; R is 0 where items are always available."""
+    position: Tensor
+    above: Tensor
+    """What `list_inputs` give; (M, 0) where there are no lists."""
     tastes: Tensor
     """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
@@ -106,6 +116,8 @@ class Design:
         both = torch.cat([repeated, alike], 1)
         liked = model.scale_rewards(history.rewards).repeat(1, 2)
         is_known = (rows.users >= 0) & (rows.users < last)
+        position, above = list_inputs(likeness, rows.above, rows.items)
+        none = torch.zeros(len(rows), 0)
         return cls(
             items=rows.items,
             users=torch.where(is_known, rows.users, last),
@@ -120,9 +132,11 @@ class Design:
             n_users=last,
             binary=bool(model.binary),
             weights=torch.ones(len(rows)) if weights is None else weights,
-            running=torch.zeros(len(rows), 0)
+            running=none
             if rows.offer is None or model.rates is None
             else model.rates.inputs(rows.offer, rows.items),
+            position=position if rows.above.shape[1] else none,
+            above=above if rows.above.shape[1] else none,
             tastes=torch.zeros(len(rows)),
         )
 
@@ -150,9 +164,7 @@ class Design:
             "user": (self.n_users + 1,),
             "content": (self.n_tags + dim,),
             "affinity": (self.n_users + 1, dim),
-            "exposure": (self.exposure.shape[1],),
-            "running": (self.running.shape[1],),
-            "state": (state,),
+            **{shared: self.inputs(shared).shape[1:] for shared in _SHARED},
             "interaction": (state, dim),
             "context": (self.observed.shape[1], dim),
         }
@@ -165,9 +177,7 @@ class Design:
             "content": lambda numbers: self.sum_content(numbers)[self.items],
             "user": lambda numbers: numbers[self.users],
             "tastes": lambda number: self.tastes * number,
-            "exposure": self.exposure.matmul,
-            "running": self.running.matmul,
-            "state": self.x.matmul,
+            **{shared: self.inputs(shared).matmul for shared in _SHARED},
             "affinity": lambda rows: (F.embedding(self.users, rows) * self.rows).sum(1),
             "interaction": lambda matrix: ((self.x @ matrix) * self.rows).sum(1),
             "context": lambda matrix: ((self.observed @ matrix) * self.rows).sum(1),
@@ -203,14 +213,20 @@ class Design:
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
-            case "exposure" | "state" | "running":
+            case _ if name in _SHARED:
                 return (weight * self.inputs(name).square()).sum(0)
         return self.inputs(name).square().T @ vectors
 
     def inputs(self, name: str) -> Tensor:
         """The inputs (M, …) that the effect `name` multiplies, the same for all items of a row."""
-        shared = {"exposure": self.exposure, "running": self.running, "context": self.observed}
-        return shared.get(name, self.x)
+        fields = {"context": "observed", "state": "x", "interaction": "x"}
+        values: Tensor = getattr(self, fields.get(name, name))
+        return values
+
+    @property
+    def decisions(self) -> Tensor:
+        """(M,) int64 numbers of the decisions that rows in the order of a log belong to."""
+        return (~self.position.any(1)).cumsum(0) - 1
 
     @property
     def count(self) -> float:
@@ -343,7 +359,7 @@ def _scale(
     penalty: float,
 ) -> tuple[_Map, _Map]:
     """Maps of an effect to units in which the objective is about evenly curved, and back."""
-    if name in ("state", "exposure", "running"):
+    if name in _SHARED:
         factor, inverse = _factors(curvature * _moments(design, design.inputs(name)), penalty)
         return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):
@@ -423,8 +439,8 @@ class EffectSearch:
     ) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""
         if held_out is None:
-            rows = len(design.items)
-            chooses = torch.arange(rows) % 5 == min(4, rows - 1)
+            decisions = design.decisions
+            chooses = decisions % 5 == min(4, int(decisions[-1]))
             design, held_out = design.select(~chooses), design.select(chooses)
         self.design, self.held_out, self._begin = design, held_out, begin
         self.effects = design.mean_effect()
@@ -536,7 +552,7 @@ class EffectSearch:
             tastes = torch.cat([level.unsqueeze(1), self.effects["affinity"][trained]], 1)
             self._root = root_of_tastes(tastes, F.pad(self.design.rows, (1, 0), value=1.0))
         self.new_users = True
-        self._fixed = Effects((name, self.effects[name]) for name in _ITEMS if name in self.effects)
+        self._fixed = Effects((name, self.effects[name]) for name in _FIXED if name in self.effects)
         self.design = self.design.forget_users()
         self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
         self.losses = self._losses(self.effects)

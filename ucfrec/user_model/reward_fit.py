@@ -55,7 +55,7 @@ _WARM_ROWS = 25_000
 """Most rows of a search that begins near an earlier one."""
 _CONSTANT = 1e-6
 _FOLDS = 5
-"""Parts of the rows, each predicted by a fit to the others."""
+"""Parts of the decisions, each predicted by a fit to the others."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -231,7 +231,8 @@ def score_unseen(
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
     weights = weigh_by_propensity(sessions, episodes, steps, len(model.item)) if weighted else None
-    design, folds = Design.of(model, rows, weights), torch.arange(len(rows)) % _FOLDS
+    design = Design.of(model, rows, weights)
+    folds = design.decisions % _FOLDS
     spreads = {effect.effect: effect.spread for effect in tried if effect.kept}
     scores = torch.zeros(len(rows))
     for fold in range(_FOLDS):

@@ -15,7 +15,7 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward import PLACES, ItemRewardModel
 
 _BINS = 10
 _CHUNK = 16_384
@@ -44,8 +44,10 @@ class RewardRows:
     """O, the last numbers of the states: what was observed beside the session itself."""
     times: Tensor
     """(M,) int64 ms; 0 without times."""
-    offer: Offer | None = None
+    offer: Offer | None
     """What was on offer; None for everything."""
+    above: Tensor
+    """(M, P) int64 items above it in its own list, −1 for none; P is 0 where there are no lists."""
 
     def __len__(self) -> int:
         return len(self.items)
@@ -90,6 +92,7 @@ class RewardRows:
             view.observation_size,
             torch.from_numpy(times),
             view.offer(episodes, steps),
+            torch.from_numpy(view.items_above(episodes, steps, PLACES)),
         )
 
 
@@ -200,6 +203,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.users[part],
             rows.items[part],
             rows.offer and rows.offer.change(itemgetter(part)),
+            rows.above[part],
         )
         for part in torch.split(torch.arange(len(rows)), _CHUNK)
     ]

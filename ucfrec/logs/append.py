@@ -103,7 +103,7 @@ def append_logs(
         return dict(remembered["appended"])
     origin = str(store / StoreRecord.FILE)
     shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
-    end = find_end(np.concatenate([shard.latest_times() for shard in shards]))
+    end = find_end(np.concatenate([np.sort(shard.times)[-_LATEST:] for shard in shards]))
     mapping = replace(
         mapping.over(LogMapping.of_source(old.source, origin)),
         earliest=datetime.fromtimestamp((end + 1) / 1000, UTC).isoformat(),
@@ -279,10 +279,6 @@ class _Shard:
         self.lengths = np.diff(self.offsets)
         self.times: IntArray = np.load(folder / f"{schema.TIMESTAMP}.npy", mmap_mode="r")
         self.stays: BoolArray = np.ones(len(self.lengths), dtype=bool)
-
-    def latest_times(self) -> IntArray:
-        """The last `_LATEST` times."""
-        return np.partition(self.times, -min(_LATEST, len(self.times)))[-_LATEST:]
 
     def load(self, name: str, rows: BoolArray) -> Array:
         """A column at the steps of some episodes (E,) or at some steps (S,), even if it is one of

@@ -407,13 +407,6 @@ def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str,
     return digests
 
 
-def write_episode_users(log: TypedLog, file: Path) -> None:
-    """Write the user of every episode, in the order of the store."""
-    source = f"{EPISODES} JOIN user_codes ON code = {USER}"
-    users = log.connection.sql(f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode")
-    write_batches(file, users.to_arrow_reader(BATCH_ROWS))
-
-
 def write_batches(file: Path, batches: pa.RecordBatchReader) -> None:
     """Write rows to a Parquet file, as DuckDB's COPY may only do in the scratch folder."""
     with pq.ParquetWriter(file, batches.schema) as writer:

@@ -103,7 +103,9 @@ def append_logs(
         return dict(remembered["appended"])
     origin = str(store / StoreRecord.FILE)
     shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
-    end = find_end(np.concatenate([np.sort(shard.times)[-_LATEST:] for shard in shards]))
+    every = (shard.times for shard in shards)
+    latest = [np.partition(times, -min(_LATEST, len(times)))[-_LATEST:] for times in every]
+    end = find_end(np.concatenate(latest))
     mapping = replace(
         mapping.over(LogMapping.of_source(old.source, origin)),
         earliest=datetime.fromtimestamp((end + 1) / 1000, UTC).isoformat(),
@@ -315,7 +317,7 @@ def _write(
     _move_train_counts(typed, shards)
     fill = {name: float(_FILL.get(name, np.nan)) for name in (*old.columns, *added)}
     with progress(log.report["steps"], "write the new shards", "steps") as bar:
-        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, log.offers, log.sets)
+        writer = write_steps(log.rows, log.cut, folder, bar, log.offers, log.sets, len(left), fill)
     ids = write_ids(typed, folder, log.offers)
     new = writer.finish(log.report["reward"], log.report, ids)
     expired = sum(int(shard.lengths[~shard.stays].sum()) for shard in shards)

@@ -168,9 +168,7 @@ def prepare(
         ):
             typed, report = log.rows.log, log.report
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(
-                    log.rows, log.cut, folder, bar, offers=log.offers, sets=log.sets
-                )
+                writer = sessions.write_steps(log.rows, log.cut, folder, bar, log.offers, log.sets)
             ids = sessions.write_ids(typed, folder, log.offers)
             for name, tables in log.features.items():
                 if tables:

@@ -4,11 +4,11 @@ Users and items get their numbers here, and every episode is counted before any 
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -203,7 +203,7 @@ class StepCounts:
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
     rewards: Moments = field(default_factory=lambda: Moments(1))
-    values: dict[float, int] = field(default_factory=dict)
+    values: Counter[float] = field(default_factory=Counter)
     """How often each reward occurred, until there are more than `FEW_VALUES` of them."""
     lowest: float = np.inf
     highest: float = -np.inf
@@ -229,12 +229,8 @@ class StepCounts:
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
         if len(self.values) <= FEW_VALUES:
-            uncounted = rewards
-            for value in self.values:
-                self.values[value] += int(np.count_nonzero(uncounted == value))
-                uncounted = uncounted[uncounted != value]
-            values, counts = (part.tolist() for part in np.unique(uncounted, return_counts=True))
-            self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
+            values, counts = (part.tolist() for part in np.unique(rewards, return_counts=True))
+            self.values.update(dict(zip(values[: FEW_VALUES + 1], counts, strict=False)))
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         training = np.repeat(episodes.splits == 0, episodes.lengths)
@@ -419,15 +415,15 @@ def write_steps(
     cut: Cut,
     folder: Path,
     display: Progress,
+    offers: "Offers | None",
+    sets: IntArray | None,
     first_shard: int = 0,
-    fill: Mapping[str, float] = MappingProxyType({}),
-    offers: "Offers | None" = None,
-    sets: IntArray | None = None,
+    fill: Mapping[str, float] | None = None,
 ) -> StoreWriter:
     """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
-    out. Empty for those of the log. `sets` has the set of candidates of each code, as of
+    out. None for those of the log. `sets` has the set of candidates of each code, as of
     `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
     """
     unavailable = total = 0
@@ -451,9 +447,10 @@ def write_steps(
             columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
         if not rows.has_lists:
             del columns[schema.PLACE]
-        names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
-        steps = {name: columns[name] for name in names}
-        steps |= {n: np.full(count, value) for n, value in fill.items() if n not in steps}
+        steps = {
+            n: columns[n] for n in schema.STEP_DTYPES if n in columns and n in (fill or columns)
+        }
+        steps |= {n: np.full(count, v) for n, v in (fill or {}).items() if n not in steps}
         first = np.zeros(count, dtype=bool)
         first[np.cumsum(lengths) - lengths] = True
         values = {

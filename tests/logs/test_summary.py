@@ -18,7 +18,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.logs import summary
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.logs.prepare import PrepareOptions, validate
 from ucfrec.logs.sessions import Moments
 
 
@@ -100,14 +100,6 @@ def test_the_condition_that_excludes_bots_can_be_pasted(tmp_path: Path, bot: str
     if where != "visitor NOT IN (…)":
         report = validate([path], LogMapping({"user_id": "visitor"}, where=where))
         assert report["dropped"]["left_out"] == 300
-
-
-def test_long_sessions_are_left_out_and_counted(tmp_path: Path) -> None:
-    path = write(with_bots([1000, 1001], 400), tmp_path / "log.parquet")
-    options = PrepareOptions(max_session=399, session_by="user")
-    report = prepare([path], LogMapping(), tmp_path / "store", options)
-    assert report["dropped"]["long_session"] == 800
-    assert (report["steps"], report["users"]) == (4000, 400)
 
 
 def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ Users and items get their numbers here, and every episode is counted before any 
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -29,8 +28,6 @@ from ucfrec.processes import Progress
 if TYPE_CHECKING:
     from ucfrec.episodes.offers import Offers
 
-FEW_VALUES = 20
-"""Rewards with at most this many distinct values are counted by value, others in as many bins."""
 EPISODES = "episodes"
 """Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
 `begins_session` and `terminated`."""
@@ -203,8 +200,6 @@ class StepCounts:
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
     rewards: Moments = field(default_factory=lambda: Moments(1))
-    values: Counter[float] = field(default_factory=Counter)
-    """How often each reward occurred, until there are more than `FEW_VALUES` of them."""
     lowest: float = np.inf
     highest: float = -np.inf
     returns: Moments = field(default_factory=lambda: Moments(2))
@@ -228,9 +223,6 @@ class StepCounts:
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
-        if len(self.values) <= FEW_VALUES:
-            values, counts = (part.tolist() for part in np.unique(rewards, return_counts=True))
-            self.values.update(dict(zip(values[: FEW_VALUES + 1], counts, strict=False)))
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         training = np.repeat(episodes.splits == 0, episodes.lengths)

@@ -436,7 +436,7 @@ def write_steps(
             )
             total += count
         if rows.observations is not None:
-            columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
+            columns[schema.OBSERVATION] = rows.observations.read(columns["row"])
         if not rows.has_lists:
             del columns[schema.PLACE]
         steps = {

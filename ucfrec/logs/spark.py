@@ -178,15 +178,11 @@ def _save(spark: Any, frame: Any, folder: Path) -> Any:
     return spark.read.parquet(re.sub(r"([\\*?{}\[\]])", r"\\\1", address))
 
 
-def _list_parts(folder: Path) -> list[Path]:
-    """The files that Spark wrote to a folder, in the order of their rows."""
-    return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
-
-
 def _read_parts(
     folder: Path, rows: int = BATCH_ROWS, columns: list[str] | None = None
 ) -> Iterator[pa.RecordBatch]:
-    for part in _list_parts(folder):
+    parts = folder.glob("part-*.parquet")
+    for part in sorted(parts, key=lambda path: (int(path.name.split("-")[1]), path.name)):
         with pq.ParquetFile(part) as file:
             yield from file.iter_batches(rows, columns=columns, use_threads=False)
 

@@ -128,6 +128,22 @@ def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes, sa
         read_rows(path)
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "does not exist"),
+        ({}, "holds no list of result rows"),
+        ([1], "row 1 is not a result row"),
+        ([WHOLE.to_json(), {}], "row 2 is not a result row"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: Any, says: str) -> None:
+    if content is not None:
+        (tmp_path / "rows.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=says):
+        read_results(tmp_path / "rows.json")
+
+
 def test_a_last_line_without_its_end_is_not_run_into(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     assert read_rows(path) == []

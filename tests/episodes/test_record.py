@@ -18,7 +18,6 @@ SOURCE = {
     "duplicates": "first", "dropped": {"duplicate": 1}, "unknown_propensities": 2,
     "time_range_ms": [1_574_553_600_000, 1_575_158_400_000],
     "split_times_ms": [1_575_072_000_000, 1_575_115_200_000],
-    "summary": {"rewards": {"values": [0, 1], "counts": [3, 4], "quantiles": {"0.5": 1}}},
 }  # fmt: skip
 NEEDED = {"version", "n_steps", "n_episodes", "n_shards", "columns", "fingerprint",
           "source"}  # fmt: skip
@@ -62,7 +61,6 @@ def test_every_entry_is_checked(store: Path, kind: str, capsys: pytest.CaptureFi
         ("columns", {"reward": [], "../../etc/passwd": []}),
         ("source", {"files": "log.parquet"}),
         ("source", {"time_range_ms": [0, 10**17]}),
-        ("source", {"summary": {"rewards": {"edges": [0], "counts": [3], "quantiles": {}}}}),
     ],
 )
 def test_what_cannot_be_is_named(store: Path, name: str, value: object) -> None:

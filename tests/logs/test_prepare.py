@@ -284,17 +284,6 @@ def test_ids_of_any_size_stay_apart(tmp_path: Path) -> None:
             assert sorted(map(int, found)) == ids.tolist()
 
 
-@pytest.mark.parametrize(("rule", "kept"), [("highest", 5.0), ("first", 3.0), ("last", 1.0)])
-def test_the_rule_for_duplicates_is_chosen_and_recorded(
-    tmp_path: Path, rule: Any, kept: float
-) -> None:
-    log = pd.DataFrame({"user_id": [1, 1, 1, 1, 2], "item_id": [1, 1, 1, 2, 2]})
-    log = log.assign(timestamp=START + np.array([0, 0, 0, 1, 2]), reward=[3.0, 5.0, 1.0, 0.0, 0.5])
-    report = prepared(tmp_path, log, PrepareOptions(duplicates=rule, embedding_size=2))
-    assert steps_of(tmp_path / "store")["reward"].tolist() == [kept, 0.0, 0.5]
-    assert (report["duplicates"], report["conflicting_duplicates"]) == (rule, 2)
-
-
 def write_large_log(path: Path, rows: int, users: pa.Array, items: pa.Array) -> int:
     """Write random rows in twelve parts; returns the bytes that they take in memory."""
     size = 0

@@ -102,7 +102,7 @@ def test_long_rows_are_sorted_in_less_memory_than_they_take(tmp_path: Path) -> N
         log = open_log(tables)
         rows = sort_rows(log, None, "highest", tmp_path)
         order = np.concatenate([batch["row"] for batch in rows.file.read()])
-        found = rows.observations.of_rows(order[9_000:9_100])
+        found = rows.observations.read(order[9_000:9_100])
     by_user = np.lexsort((np.arange(20_000), np.arange(20_000) % 7))
     np.testing.assert_array_equal(order, by_user + 1)
     np.testing.assert_array_equal(found, numbers[by_user[9_000:9_100]])

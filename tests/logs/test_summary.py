@@ -1,24 +1,18 @@
 """The owner of a log sees what is in it, what is lost, and of bots."""
 
-import itertools
 import re
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.logs import START, random_log, store_of, write
-from ucfrec import schema
-from ucfrec.arrays import Array
-from ucfrec.episodes.store import EpisodeStore
+from tests.support.logs import START, random_log, write
 from ucfrec.errors import InputNote
-from ucfrec.logs import summary
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.logs.prepare import PrepareOptions, validate
 from ucfrec.logs.sessions import Moments
 
 
@@ -102,14 +96,6 @@ def test_the_condition_that_excludes_bots_can_be_pasted(tmp_path: Path, bot: str
         assert report["dropped"]["left_out"] == 300
 
 
-def test_long_sessions_are_left_out_and_counted(tmp_path: Path) -> None:
-    path = write(with_bots([1000, 1001], 400), tmp_path / "log.parquet")
-    options = PrepareOptions(max_session=399, session_by="user")
-    report = prepare([path], LogMapping(), tmp_path / "store", options)
-    assert report["dropped"]["long_session"] == 800
-    assert (report["steps"], report["users"]) == (4000, 400)
-
-
 def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path) -> None:
     log = make_log(200).assign(member=[None, "M1", "M9", "M2"] * 50)
     path, where = write(log, tmp_path / "log.csv"), "member <> 'M9'"
@@ -135,60 +121,3 @@ def test_batches_give_the_moments_of_all() -> None:
     assert moments.count == 1000
     np.testing.assert_allclose(moments.mean, values.mean(axis=1), rtol=1e-15)
     np.testing.assert_allclose(moments.covariance, np.cov(values, ddof=0), rtol=1e-6)
-
-
-def prepared(tmp_path: Path, rewards: Array) -> EpisodeStore:
-    """A store of sessions of several lengths, with items of several popularities."""
-    generator, rows = np.random.default_rng(0), len(rewards)
-    columns = {
-        "user_id": np.sort(generator.geometric(0.05, rows)),
-        "item_id": generator.geometric(0.2, rows),
-        "timestamp": START + np.arange(rows) * 1000,
-        "reward": rewards,
-    }
-    log = pd.DataFrame(columns).sample(frac=1, random_state=1)
-    return store_of(log, tmp_path, split=(1.0, 0.0, 0.0), embedding_size=2)
-
-
-def counted(values: Array, found: dict[str, Any]) -> None:
-    """Check bins and quantiles against the values themselves."""
-    edges = found["edges"]
-    expected = [((values >= a) & (values < b)).sum() for a, b in itertools.pairwise(edges)]
-    assert [*found["counts"]] == expected
-    assert sum(expected) == len(values)
-    exact = np.quantile(values, [float(q) for q in found["quantiles"]], method="inverted_cdf")
-    assert list(found["quantiles"].values()) == pytest.approx(exact.tolist())
-
-
-def test_lengths_popularity_and_few_rewards(tmp_path: Path) -> None:
-    rewards = np.random.default_rng(1).integers(3, size=900) / 2
-    store = prepared(tmp_path, rewards)
-    summary = store.record.source.model_dump()["summary"]
-    counted(store.lengths, summary["session_lengths"])
-    assert summary["session_lengths"]["edges"][:4] == (1, 2, 4, 8)
-    items = store.step_values(schema.ITEM, *store.all_steps())
-    counted(np.bincount(items), summary["item_popularity"])
-    assert [*summary["rewards"]["values"]] == [0, 0.5, 1]
-    assert [*summary["rewards"]["counts"]] == np.bincount((rewards * 2).astype(int)).tolist()
-
-
-def test_many_rewards_fall_into_equal_bins_and_none_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rewards = np.random.default_rng(1).standard_cauchy(1200)
-    found = prepared(tmp_path, rewards).record.source.model_dump()["summary"]["rewards"]
-    assert len(found["counts"]) == 20
-    assert sum(found["counts"]) == 1200
-    np.testing.assert_allclose(np.diff(found["edges"]), np.ptp(found["edges"]) / 20)
-    low, high = found["quantiles"]["0.01"], found["quantiles"]["0.99"]
-    assert (found["edges"][0], found["edges"][-1]) == pytest.approx((low, high))
-    assert low == pytest.approx(np.quantile(rewards, 0.01, method="inverted_cdf"))
-    inner = np.histogram(rewards, found["edges"])[0][1:-1]
-    assert np.abs(np.array(found["counts"][1:-1]) - inner).max() <= 1  # a value on an edge
-    assert found["counts"][0] == (rewards < found["edges"][1]).sum()
-    # A larger log is sampled, to the same answer whatever the order of its rows.
-    monkeypatch.setattr(summary, "SAMPLE_ROWS", 400)
-    (tmp_path / "again").mkdir()
-    sampled = prepared(tmp_path / "again", rewards).record.source.model_dump()["summary"]["rewards"]
-    assert abs(sampled["quantiles"]["0.5"]) < 0.5
-    assert sum(sampled["counts"]) == 1200

@@ -65,6 +65,8 @@ def test_rows_are_the_logs(
     log: pd.DataFrame, trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
+    columns = "user_id session timestamp item_id reward propensity probability rank greedy_item_id"
+    assert list(frame.columns) == columns.split()
     log = log.sort_values(["user_id", "timestamp"])
     for name in ("user_id", "item_id", "timestamp", "reward"):
         np.testing.assert_array_equal(frame[name], log[name])

@@ -11,9 +11,7 @@ from tests.support import killed_run
 from tests.support.report_page import HOSTILE, number, page_of, record_of, rewritten, row
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import METRICS, MetricsLog, read_metrics
-from ucfrec.reporting.page import write_report
 from ucfrec.results.rows import append_rows, write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -171,44 +169,6 @@ def test_long_curves_are_thinned_to_their_end(runs: Path, tmp_path: Path) -> Non
     assert number(table["1003"]["long"]) == pytest.approx(1003 / 7, rel=1e-3)
     gaps = np.diff([int(step) for step in table])
     assert gaps.max() - gaps.min() <= 1  # but for the step that was not finite
-
-
-def test_what_policies_earn_comes_by_environment_with_intervals(runs: Path, tmp_path: Path) -> None:
-    policies = ("ucf", 3.25, 1000, 7.5), ("ucf", 2.25, 1001, 6.5), ("random", -1.0, None, 5.5)
-    episodes = {"episodes": 2000}
-    rows = [
-        row("a", name, value, training_seed=seed, metrics={"length": length}, conditions=episodes)
-        for name, value, seed, length in policies
-    ]
-    write_results(tmp_path / "rows.json", rows)
-    append_rows(tmp_path / "more.jsonl", [row("b", "ucf", 8.0)])
-    results = (tmp_path / "rows.json", tmp_path / "more.jsonl")
-    page = page_of(tmp_path / "report.html", runs / "dt", results=results)
-    first, second = (page.tables[f"evaluate, {name}: R_cum{_CAPTION}"] for name in "ab")
-    assert list(first) == ["ucf, training seed 1000", "ucf, training seed 1001", "random"]
-    assert first["ucf, training seed 1000"]["R_cum"] == "3.25 [2.75, 4.75]"
-    assert first["random"] == {"R_cum": "-1 [-1.5, 0.5]", "length": "5.5"}
-    assert list(second["ucf"]) == ["R_cum"]
-    assert "ucf, training seed 1000: 3.25 [2.75, 4.75]" in page.raw
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (None, "does not exist"),
-        ("{}", "holds no list of result rows"),
-        ("[1]", "row 1 is not a result row"),
-        (json.dumps([row("a", "ucf", 1.0).to_json(), {}]), "row 2 is not a result row"),
-    ],
-)
-def test_other_files_are_refused(
-    runs: Path, tmp_path: Path, content: str | None, says: str
-) -> None:
-    if content is not None:
-        (tmp_path / "rows.json").write_text(content)
-    with pytest.raises(InputError, match=says):
-        write_report(tmp_path / "report.html", [runs / "dt"], [tmp_path / "rows.json"])
-    assert not (tmp_path / "report.html").exists()
 
 
 def test_a_folder_that_is_no_run_is_named(

@@ -136,46 +136,36 @@ def test_a_run_is_shown_with_what_it_recorded(folder: Path, tmp_path: Path) -> N
         assert f"{what}: not recorded." in text, what
 
 
-def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_path: Path) -> None:
+def test_estimates_from_logs_have_tables_with_their_warnings(folder: Path, tmp_path: Path) -> None:
     same: dict[str, Any] = {
         "metrics": {"effective_sessions": 33.25, "largest_weight": 0.5, "overlap": 1.01},
-        "details": {"warnings": [HOSTILE], "verdict": "Do not rely on it"},
+        "details": {"warnings": [HOSTILE], "verdict": f"Do not rely on it: {HOSTILE}"},
     }
     of = {"sessions": 600, "run": "runs/ucf"}
+    step: dict[str, Any] = {"table": "per step", "metric": "R_step", "conditions": of}
+    step["metrics"] = {"effective_steps": 9.5, "largest_weight": 0.5}
     rows = [
         estimate("logged", 2.0, "behavior", conditions={**of, "choice": "as logged"}, **same),
         estimate("DR", 3.0, conditions={**of, "choice": "softmax"}, **same),
+        estimate("DM", 3.0, interval=None, conditions={**of, "choice": "softmax"}, **same),
+        estimate("logged", 0.25, "behavior", interval=(0.125, 0.5), **step),
+        estimate("DR", 0.5, interval=None, **step),
     ]
     fewer = [replace(row, conditions={**row.conditions, "sessions": 500}) for row in rows]
     write_results(tmp_path / "ope.json", [*rows, *fewer])
     page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
     assert "Estimates for ucf, sessions 500" in page.tables
     table = page.tables["Estimates for ucf, sessions 600"]
+    assert list(table) == ["logged", "DR", "DM"]
     assert table["DR"] == {
         "R_cum": "3 [2.5, 4.5]", "effective_sessions": "33.25", "largest_weight": "0.5",
         "sessions": "600", "overlap": "1.01",
     }  # fmt: skip
     assert table["logged"]["R_cum"] == "2 [1.5, 3.5]"
+    assert table["DM"]["R_cum"] == "3 [–]"
+    table = page.tables["Estimates per step for ucf, sessions 600"]
+    assert table["logged"]["R_step"] == "0.25 [0.125, 0.5]"
+    assert table["DR"] == {"R_step": "0.5 [–]", "effective_steps": "9.5", "largest_weight": "0.5"}
     assert page.text.index("Do not rely on it") < page.text.index("Trained on")
     assert HOSTILE in page.text
     assert not {tag for tag, _ in page.elements} & {"script", "img"}
-
-
-def test_estimates_per_step_have_a_table_of_their_own(folder: Path, tmp_path: Path) -> None:
-    verdict = {"verdict": f"Do not rely on it: {HOSTILE}"}
-    rows = [
-        estimate("logged", 2.0, "behavior"),
-        estimate("DM", 3.0, interval=None, details=verdict),
-    ]
-    step: dict[str, Any] = {"table": "per step", "metric": "R_step"}
-    step["metrics"] = {"effective_steps": 9.5, "largest_weight": 0.5}
-    rows.append(estimate("logged", 0.25, "behavior", interval=(0.125, 0.5), **step))
-    rows.append(estimate("DR", 0.5, interval=None, **step))
-    write_results(tmp_path / "ope.json", rows)
-    page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
-    assert list(page.tables["Estimates for ucf"]) == ["logged", "DM"]
-    assert page.tables["Estimates for ucf"]["DM"]["R_cum"] == "3 [–]"
-    assert f"Do not rely on it: {HOSTILE}" in page.text
-    table = page.tables["Estimates per step for ucf"]
-    assert table["logged"]["R_step"] == "0.25 [0.125, 0.5]"
-    assert table["DR"] == {"R_step": "0.5 [–]", "effective_steps": "9.5", "largest_weight": "0.5"}

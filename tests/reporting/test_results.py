@@ -110,9 +110,12 @@ def test_seeds_of_training_are_taken_together(tmp_path: Path) -> None:
 def test_rows_of_any_metric_have_a_picture_and_a_table_from_the_best(tmp_path: Path) -> None:
     measured = {"ucf": 0.25, "popular": 0.5}
     ranked = [row("a", n, x, metric="hit", metrics={"hit": x}) for n, x in measured.items()]
-    returns, hits = findings_of(tmp_path, [earned("ucf", 3.0)], ranked)
+    seeds = [earned("ucf", 3.0, training_seed=seed, metrics={"length": 7.5}) for seed in (0, 1)]
+    returns, other, hits = findings_of(tmp_path, seeds, [row("b", "ucf", 8.0)], ranked)
     assert returns.chart is not None
-    assert returns.chart.summary == "ucf: 3 [2.9, 3.1]"
+    assert returns.chart.summary.startswith("ucf, training seed 0: 3 [2.9, 3.1]. ucf, training")
+    assert returns.tables[0].rows[0] == ("ucf, training seed 0", ["3 [2.9, 3.1]", "7.5"])
+    assert (other.subject, other.tables[0].columns) == ("evaluate, b", ["R_cum"])
     assert [name for name, _ in hits.tables[0].rows] == ["popular", "ucf"]
 
 

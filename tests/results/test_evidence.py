@@ -6,24 +6,21 @@ from ucfrec.results.evidence import UNMEASURED, Evidence
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "margin", "standing"),
+    ("low", "high", "standing"),
     [
-        (0.1, 0.3, 0.0, "better"),
-        (-0.3, -0.1, 1.0, "worse"),
-        (-0.1, 0.3, 0.2, "open"),
-        (-0.1, 0.1, 0.2, "level"),
-        (0.0, 0.0, 0.0, "level"),
-        (None, None, 1.0, "open"),
+        (0.1, 0.3, "better"),
+        (-0.3, -0.1, "worse"),
+        (-0.1, 0.3, "open"),
+        (0.0, 0.0, "level"),
+        (None, None, "open"),
     ],
 )
-def test_the_interval_decides(
-    low: float | None, high: float | None, margin: float, standing: str
-) -> None:
+def test_the_interval_decides(low: float | None, high: float | None, standing: str) -> None:
     evidence = Evidence(0.0, low, high)
-    assert evidence.standing(margin) == standing
+    assert evidence.standing() == standing
     assert evidence.is_reliable == (low is not None)
     doubted = Evidence(0.0, low, high, ("too few users",))
-    assert doubted.standing(margin) == "open"
+    assert doubted.standing() == "open"
     assert doubted.format() == UNMEASURED.format() == "–"
 
 

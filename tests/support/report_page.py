@@ -15,7 +15,6 @@ from ucfrec.results.rows import ResultRow
 VOID = {"meta", "br", "img", "link", "input", "hr"}
 HOSTILE = "</title><script>alert('1')</script><img src=x onerror=\"alert(2)\">&amp;"
 
-QUANTILES = {"0": 1.0, "0.25": 1.0, "0.5": 2.0, "0.75": 3.0, "0.99": 6.5, "1": 7.0}
 SOURCE: dict[str, Any] = {
     "rows_read": 1200,
     "dropped": {"null_key": 3, "duplicate": 12, "conflicting_duplicate": 6, "short_episode": 0},
@@ -25,11 +24,6 @@ SOURCE: dict[str, Any] = {
     **{"reward": "r", "session_by": "gap", "reward_statistics": {"mean": 0.5}},
     **{"splits": {}, "files": ["log.csv"], "users": 90, "sessions": 8, "sessions_cut": 0},
     **{"conflicting_duplicates": 6, "equal_times": 0, "time_range_ms": [0, 86_400_000]},
-    "summary": {
-        "session_lengths": {"edges": [1, 2, 4, 8], "counts": [4, 3, 1], "quantiles": QUANTILES},
-        "rewards": {"values": [0.0, 1.0], "counts": [900, 279], "quantiles": QUANTILES},
-        "item_popularity": {"edges": [0, 1, 2], "counts": [1, 8], "quantiles": QUANTILES},
-    },
 }
 """What `prepare` reports of a store."""
 

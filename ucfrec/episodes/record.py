@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.files.record import Count, Entry, Number, Record, Text
+from ucfrec.files.record import Count, Entry, Record, Text
 
 Milliseconds = Annotated[int, Field(strict=True, ge=-62_135_596_800_000, lt=253_402_300_800_000)]
 """Since the Unix epoch, in the years 1 to 9999."""
@@ -18,25 +18,6 @@ LONG = 100
 """Times the median from which on a session is hardly a person's."""
 _Positive = Annotated[int, Field(strict=True, ge=1, lt=2**48)]
 _Width = Annotated[int, Field(strict=True, ge=1, le=2**24)]
-
-
-class Distribution(Entry):
-    """A histogram of values of the logs, with quantiles."""
-
-    counts: tuple[Count, ...]
-    values: tuple[Number, ...] | None = None
-    """The (N,) values that are counted; None for bins."""
-    edges: tuple[Number, ...] | None = None
-    """(N + 1,) edges of bins, each with its left edge but without its right one."""
-    quantiles: dict[str, Number]
-    """By share, e.g. `{"0.5": 3}`."""
-
-
-def _consistent(distribution: Distribution) -> Distribution:
-    ends = (distribution.values or ()) if distribution.edges is None else distribution.edges[1:]
-    if len(ends) != len(distribution.counts):
-        raise ValueError("it has other numbers of counts and of values or bins")
-    return distribution
 
 
 class Source(Entry):
@@ -88,9 +69,6 @@ class Source(Entry):
     """First and last time."""
     split_times_ms: tuple[Milliseconds, Milliseconds] | None = None
     """Times at which validation and test begin."""
-    summary: dict[Text, Annotated[Distribution, AfterValidator(_consistent)]] = Field(
-        default_factory=dict
-    )
 
     @property
     def others(self) -> Mapping[str, Any]:

@@ -103,7 +103,9 @@ def append_logs(
         return dict(remembered["appended"])
     origin = str(store / StoreRecord.FILE)
     shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
-    end = find_end(np.concatenate([shard.latest_times() for shard in shards]))
+    every = (shard.times for shard in shards)
+    latest = [np.partition(times, -min(_LATEST, len(times)))[-_LATEST:] for times in every]
+    end = find_end(np.concatenate(latest))
     mapping = replace(
         mapping.over(LogMapping.of_source(old.source, origin)),
         earliest=datetime.fromtimestamp((end + 1) / 1000, UTC).isoformat(),
@@ -280,10 +282,6 @@ class _Shard:
         self.times: IntArray = np.load(folder / f"{schema.TIMESTAMP}.npy", mmap_mode="r")
         self.stays: BoolArray = np.ones(len(self.lengths), dtype=bool)
 
-    def latest_times(self) -> IntArray:
-        """The last `_LATEST` times."""
-        return np.partition(self.times, -min(_LATEST, len(self.times)))[-_LATEST:]
-
     def load(self, name: str, rows: BoolArray) -> Array:
         """A column at the steps of some episodes (E,) or at some steps (S,), even if it is one of
         episodes."""
@@ -319,7 +317,7 @@ def _write(
     _move_train_counts(typed, shards)
     fill = {name: float(_FILL.get(name, np.nan)) for name in (*old.columns, *added)}
     with progress(log.report["steps"], "write the new shards", "steps") as bar:
-        writer = write_steps(log.rows, log.cut, folder, bar, len(left), fill, log.offers, log.sets)
+        writer = write_steps(log.rows, log.cut, folder, bar, log.offers, log.sets, len(left), fill)
     ids = write_ids(typed, folder, log.offers)
     new = writer.finish(log.report["reward"], log.report, ids)
     expired = sum(int(shard.lengths[~shard.stays].sum()) for shard in shards)

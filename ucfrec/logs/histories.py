@@ -309,5 +309,5 @@ def _read_users(
                 session_ids=rows[SESSION][recent] if by_session else None,
                 seen_owner=seen_owner,
                 seen_ids=items[seen],
-                observations=None if observations is None else observations.of_rows(newest),
+                observations=None if observations is None else observations.read(newest),
             )

@@ -213,7 +213,7 @@ def _select_others(table: Table, keys: Table, further: _Further) -> str:
     values |= {alias: quote_name(names[key]) for key, alias in more.items()}
     columns = [name for key, name in names.items() if key in more or key in _OTHERS]
     selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
-    return f"{selects} FROM {keys.with_texts([n for n in columns if n not in texts], texts).sql}"
+    return f"{selects} FROM {keys.add_texts([n for n in columns if n not in texts], texts).sql}"
 
 
 def _make_feedback(
@@ -252,7 +252,7 @@ def _make_feedback(
             values.append(f"nullif(CAST({column} AS DOUBLE), 0) AS value_{n}")
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
-        source = narrow.with_texts(present.values(), requests)
+        source = narrow.add_texts(present.values(), requests)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     conditions = ["true"]
     if mapping.where is not None:

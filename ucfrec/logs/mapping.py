@@ -249,6 +249,7 @@ def read_mapping(path: Path) -> LogMapping:
         if sets := values.get("candidate_sets"):
             sets = [sets] if isinstance(sets, str) else sets
             values["candidate_sets"] = tuple(_beside(path, file) for file in sets)
+        texts = ("key", "first_by", "available_from", "available_until")
         for kind in {"item_features", "user_features"} & values.keys():
             for table in values[kind]:
                 _require_keys(f"[[{kind}]]", table, FeatureTable)
@@ -256,12 +257,8 @@ def read_mapping(path: Path) -> LogMapping:
                 replace(
                     features,
                     files=tuple(_beside(path, file) for file in features.files),
-                    key=Expression(features.key, origin),
                     columns=tuple(Expression(column, origin) for column in features.columns),
-                    **{
-                        name: Expression(getattr(features, name), origin)
-                        for name in ("first_by", "available_from", "available_until")
-                    },
+                    **{name: Expression(getattr(features, name), origin) for name in texts},
                 )
                 for features in (FeatureTable(**table) for table in values[kind])
             )

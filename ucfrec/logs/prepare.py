@@ -24,7 +24,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
 from ucfrec.logs.candidates import list_set_files
-from ucfrec.logs.engine import engine, explain_errors
+from ucfrec.logs.engine import BATCH_ROWS, engine, explain_errors
 from ucfrec.logs.features import (
     count_features,
     encode_ids,
@@ -34,7 +34,7 @@ from ucfrec.logs.features import (
     require_known_ids,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
-from ucfrec.logs.rows import SortedRows, sort_rows
+from ucfrec.logs.rows import USER, SortedRows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
@@ -168,9 +168,7 @@ def prepare(
         ):
             typed, report = log.rows.log, log.report
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = sessions.write_steps(
-                    log.rows, log.cut, folder, bar, offers=log.offers, sets=log.sets
-                )
+                writer = sessions.write_steps(log.rows, log.cut, folder, bar, log.offers, log.sets)
             ids = sessions.write_ids(typed, folder, log.offers)
             for name, tables in log.features.items():
                 if tables:
@@ -185,7 +183,10 @@ def prepare(
                 encoded = encode_ids(typed.connection, log.features)
                 write_item_states(folder, log.scratch, encoded, options.embedding_size)
             if like is not None:
-                sessions.write_episode_users(typed, folder / sessions.EPISODE_USERS)
+                source = f"{sessions.EPISODES} JOIN user_codes ON code = {USER}"
+                query = f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode"
+                users = typed.connection.sql(query).to_arrow_reader(BATCH_ROWS)
+                sessions.write_batches(folder / sessions.EPISODE_USERS, users)
             record.seal(folder)
     return report
 

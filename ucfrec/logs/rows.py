@@ -89,7 +89,7 @@ class RowVectors:
             self._memory = out.getvalue() if isinstance(out, io.BytesIO) else b""
         self._shape = rows, size
 
-    def of_rows(self, rows: IntArray) -> Float32Array:
+    def read(self, rows: IntArray) -> Float32Array:
         """(M, O) observations of the rows at the positions (M,), from 1."""
         if self._file is None:
             return np.frombuffer(self._memory, np.float32).reshape(self._shape)[rows - 1]
@@ -230,7 +230,7 @@ class SortedRows:
         places = np.flatnonzero(repeated | np.append(repeated[1:], False))
         some = {name: values[places] for name, values in batch.items()}
         if self.observations is not None:
-            some[schema.OBSERVATION] = self.observations.of_rows(some["row"])
+            some[schema.OBSERVATION] = self.observations.read(some["row"])
         groups = np.cumsum(~repeated)[places]
         order = places[np.lexsort([*order_duplicates(some, duplicates), groups])]
         source = np.arange(len(repeated))

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,8 +28,6 @@ from ucfrec.processes import Progress
 if TYPE_CHECKING:
     from ucfrec.episodes.offers import Offers
 
-FEW_VALUES = 20
-"""Rewards with at most this many distinct values are counted by value, others in as many bins."""
 EPISODES = "episodes"
 """Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
 `begins_session` and `terminated`."""
@@ -203,8 +200,6 @@ class StepCounts:
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
     rewards: Moments = field(default_factory=lambda: Moments(1))
-    values: dict[float, int] = field(default_factory=dict)
-    """How often each reward occurred, until there are more than `FEW_VALUES` of them."""
     lowest: float = np.inf
     highest: float = -np.inf
     returns: Moments = field(default_factory=lambda: Moments(2))
@@ -228,13 +223,6 @@ class StepCounts:
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
-        if len(self.values) <= FEW_VALUES:
-            uncounted = rewards
-            for value in self.values:
-                self.values[value] += int(np.count_nonzero(uncounted == value))
-                uncounted = uncounted[uncounted != value]
-            values, counts = (part.tolist() for part in np.unique(uncounted, return_counts=True))
-            self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         training = np.repeat(episodes.splits == 0, episodes.lengths)
@@ -407,13 +395,6 @@ def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str,
     return digests
 
 
-def write_episode_users(log: TypedLog, file: Path) -> None:
-    """Write the user of every episode, in the order of the store."""
-    source = f"{EPISODES} JOIN user_codes ON code = {USER}"
-    users = log.connection.sql(f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode")
-    write_batches(file, users.to_arrow_reader(BATCH_ROWS))
-
-
 def write_batches(file: Path, batches: pa.RecordBatchReader) -> None:
     """Write rows to a Parquet file, as DuckDB's COPY may only do in the scratch folder."""
     with pq.ParquetWriter(file, batches.schema) as writer:
@@ -426,15 +407,15 @@ def write_steps(
     cut: Cut,
     folder: Path,
     display: Progress,
+    offers: "Offers | None",
+    sets: IntArray | None,
     first_shard: int = 0,
-    fill: Mapping[str, float] = MappingProxyType({}),
-    offers: "Offers | None" = None,
-    sets: IntArray | None = None,
+    fill: Mapping[str, float] | None = None,
 ) -> StoreWriter:
     """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
-    out. Empty for those of the log. `sets` has the set of candidates of each code, as of
+    out. None for those of the log. `sets` has the set of candidates of each code, as of
     `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
     """
     unavailable = total = 0
@@ -455,12 +436,13 @@ def write_steps(
             )
             total += count
         if rows.observations is not None:
-            columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
+            columns[schema.OBSERVATION] = rows.observations.read(columns["row"])
         if not rows.has_lists:
             del columns[schema.PLACE]
-        names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
-        steps = {name: columns[name] for name in names}
-        steps |= {n: np.full(count, value) for n, value in fill.items() if n not in steps}
+        steps = {
+            n: columns[n] for n in schema.STEP_DTYPES if n in columns and n in (fill or columns)
+        }
+        steps |= {n: np.full(count, v) for n, v in (fill or {}).items() if n not in steps}
         first = np.zeros(count, dtype=bool)
         first[np.cumsum(lengths) - lengths] = True
         values = {

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pyarrow.dataset import dataset
 
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote, one_line
@@ -113,9 +114,7 @@ def sort_with_spark(
         _save(spark, spark.sql(order_rows(log, FAULTY)), scratch / _SORTED)
         counts = dict(spark.sql(FAULT_COUNTS).collect())
     for table in code_tables(log).values():
-        parts = (batch for batch in _read_parts(scratch / table) if batch.num_rows)
-        columns = pq.read_schema(_list_parts(scratch / table)[0])
-        log.connection.register("loaded", pa.RecordBatchReader.from_batches(columns, parts))
+        log.connection.register("loaded", dataset(scratch / table))
         log.connection.execute(f"CREATE TABLE {table} AS SELECT * FROM loaded")
         log.connection.unregister("loaded")
     names = ["row", schema.OBSERVATION]
@@ -179,15 +178,11 @@ def _save(spark: Any, frame: Any, folder: Path) -> Any:
     return spark.read.parquet(re.sub(r"([\\*?{}\[\]])", r"\\\1", address))
 
 
-def _list_parts(folder: Path) -> list[Path]:
-    """The files that Spark wrote to a folder, in the order of their rows."""
-    return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
-
-
 def _read_parts(
     folder: Path, rows: int = BATCH_ROWS, columns: list[str] | None = None
 ) -> Iterator[pa.RecordBatch]:
-    for part in _list_parts(folder):
+    parts = folder.glob("part-*.parquet")
+    for part in sorted(parts, key=lambda path: (int(path.name.split("-")[1]), path.name)):
         with pq.ParquetFile(part) as file:
             yield from file.iter_batches(rows, columns=columns, use_threads=False)
 

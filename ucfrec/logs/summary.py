@@ -11,29 +11,16 @@ import duckdb
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.record import LONG
 from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
-from ucfrec.logs.rows import REASONS, SortedRows, mix_bits
-from ucfrec.logs.sessions import (
-    EPISODES,
-    FEW_VALUES,
-    USED_ITEMS,
-    USED_USERS,
-    Cut,
-    StepCounts,
-    read_episodes,
-)
+from ucfrec.logs.rows import REASONS, SortedRows
+from ucfrec.logs.sessions import EPISODES, USED_USERS, Cut, StepCounts
 from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
-SAMPLE_ROWS = 100_000
-"""Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
-used whole."""
-QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 MANY = 0.2
 """Share of the rows from which on what happens to them is worth a warning."""
 FEW_IDS = 20
@@ -55,10 +42,6 @@ _REMEDIES = {
     "unknown_item": "bring the run up to date, or leave those rows out",
     "duplicate": "log finer times, or remove the repetitions",
 }
-
-Distribution = dict[str, Any]
-"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
-right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 
 
 def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, Any]:
@@ -90,7 +73,6 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "session_by": cut.session_by,
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": None if cut.leave_last else list(cut.bounds),
-        "summary": _measure_distributions(rows, cut, counts),
         "steps": counts.steps,
         "episodes": sum(split["episodes"] for split in splits.values()),
         "sessions": sessions,
@@ -112,70 +94,6 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
     if schema.PROPENSITY in log.columns:
         report["unknown_propensities"] = counts.unknown_propensities
     return report
-
-
-def _measure_distributions(
-    rows: SortedRows, cut: Cut, counts: StepCounts
-) -> dict[str, Distribution]:
-    """`session_lengths`: episodes by length in steps. `rewards`: steps by reward; the outer bins
-    include the values beyond them. `item_popularity`: items by the steps that show them."""
-    connection = rows.log.connection
-    result = {"session_lengths": _bin_counts(connection, f"SELECT steps FROM {EPISODES}")}
-    if len(counts.values) <= FEW_VALUES:
-        values = np.array(sorted(counts.values))
-        n_steps = np.array([counts.values[value] for value in values])
-        result["rewards"] = {
-            "values": values.tolist(),
-            "counts": n_steps.tolist(),
-            "quantiles": _weigh_quantiles(values, n_steps),
-        }
-    else:
-        result["rewards"] = _bin_rewards(rows, cut, counts)
-    if rows.log.key == schema.ITEM_ID:
-        query = f"SELECT coalesce(steps, 0) FROM items LEFT JOIN {USED_ITEMS} USING (item_id)"
-        result["item_popularity"] = _bin_counts(connection, query)
-    return result
-
-
-def _bin_counts(connection: duckdb.DuckDBPyConnection, query: str) -> Distribution:
-    """Distribution of integers ≥ 0, the only column of a query, in bins 0, 1, 2–3, 4–7, …"""
-    rows = connection.sql(
-        f"SELECT value, count(*) FROM ({query}) AS of_query(value) GROUP BY value ORDER BY value"
-    ).fetchall()
-    values, counts = np.array(rows).T
-    edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
-    edges = edges[1:] if values[0] > 0 else edges
-    binned, _ = np.histogram(values, edges, weights=counts)
-    return {
-        "edges": edges,
-        "counts": binned.astype(np.int64).tolist(),
-        "quantiles": _weigh_quantiles(values, counts),
-    }
-
-
-def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution:
-    """Distribution of rewards of many values."""
-    every, sample = max(1, round(counts.steps / SAMPLE_ROWS)), []
-    for episodes in read_episodes(rows, cut):
-        rewards, times = (episodes.rows[name] for name in (schema.REWARD, schema.TIMESTAMP))
-        # By hash, so that the order of rows in the files does not matter.
-        keys = np.repeat(episodes.users, episodes.lengths).astype(np.uint64) << np.uint64(41)
-        sample.append(rewards[mix_bits(keys + times.astype(np.uint64)) % np.uint64(every) == 0])
-    ordered = np.sort(np.concatenate(sample))
-    quantiles = _weigh_quantiles(ordered, np.ones(len(ordered), dtype=np.int64))
-    low, high = quantiles["0.01"], quantiles["0.99"]
-    if not low < high:
-        low, high = counts.lowest, counts.highest
-    edges = np.linspace(low, high, FEW_VALUES + 1)
-    within = np.array([-np.inf, *edges[1:-1], np.inf])
-    filled = sum(np.histogram(e.rows[schema.REWARD], within)[0] for e in read_episodes(rows, cut))
-    return {"edges": edges.tolist(), "counts": np.asarray(filled).tolist(), "quantiles": quantiles}
-
-
-def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
-    """Quantiles, each one of the ascending values, of which there are `counts`."""
-    chosen = np.quantile(values, QUANTILES, weights=counts, method="inverted_cdf").tolist()
-    return {f"{share:g}": value for share, value in zip(QUANTILES, chosen, strict=True)}
 
 
 def format_report(report: Mapping[str, Any]) -> str:
@@ -387,7 +305,7 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
             "between; check --column item_id and --where",
         )
-    median = report["summary"]["session_lengths"]["quantiles"]["0.5"]
+    (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES}")
     longest = rows.log.connection.sql(
         f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
         f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"

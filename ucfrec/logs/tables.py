@@ -93,7 +93,7 @@ class Table:
         """The same table with some of its columns, so that others cost nothing."""
         return replace(self, selected=tuple(dict.fromkeys(selected)), raw=tuple(dict.fromkeys(raw)))
 
-    def with_texts(self, selected: Iterable[str], texts: Iterable[str]) -> "Table":
+    def add_texts(self, selected: Iterable[str], texts: Iterable[str]) -> "Table":
         """The same table with more columns, and with those that `text_of` needs."""
         selected = [*(self.selected or ()), *selected]
         if self.columnar:

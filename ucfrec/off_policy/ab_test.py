@@ -326,7 +326,7 @@ def _sum_by_user(
                 f"SELECT nullif({ids[0]}, '') AS who, nullif({ids[1]}, '') AS arm, "
                 f"CAST({value.sql} AS DOUBLE) AS value, "
                 f"{f'CAST({part.sql} AS VARCHAR)' if part else 'NULL'} AS part "
-                f"FROM {table.with_texts(columns, (schema.USER_ID, schema.ARM)).sql}"
+                f"FROM {table.add_texts(columns, (schema.USER_ID, schema.ARM)).sql}"
             )
         mixed = "coalesce(min(arm) OVER users <> max(arm) OVER users, false)"
         with explain_errors(connection, tables):

@@ -155,7 +155,9 @@ def normalise_by_step(
         left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
     """
     weights, step = steps.weights, steps.step
-    sessions, totals = len(steps.first), steps.step_totals()
+    sessions, totals = len(steps.first), np.bincount(step, weights)
+    # W_t by step of the longest session; sessions that ended have their last weight.
+    totals += np.cumsum(np.bincount(steps.lengths, steps.session_weights, len(totals) + 1))[:-1]
     by_step = steps.discount ** np.arange(len(totals))
     rewarded = by_step * np.bincount(step, weights * left) / totals
     mine = steps.discounts * weights * left / totals[step]

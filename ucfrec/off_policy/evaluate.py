@@ -24,7 +24,7 @@ from ucfrec.off_policy.answer import (
     cut_to_steps,
 )
 from ucfrec.off_policy.estimators import LOGGED, SUITE, Estimate, estimate, session_terms
-from ucfrec.off_policy.guardrails import Groups, Guardrail, check_guardrail, compare_groups
+from ucfrec.off_policy.guardrails import Guardrail, check_guardrail, compare_groups
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Positions, merge_lists
 from ucfrec.off_policy.models import (
     InputsFile,
@@ -150,16 +150,13 @@ class WeighedLogs:
     """Logged steps, and what the logs say of an estimate beside their weights."""
 
     steps: LoggedSteps
+    logged: LoggedSessions
     columns: dict[str, Any]
     """Further columns of the result rows."""
     segment: IntArray
     """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
     declared: str
-    fingerprint: str
     models: ModelReport
-    measures: Mapping[str, Float64Array]
-    groups: Groups | None
-    """As of `LoggedSessions`."""
     traffic: Traffic
     nearby: str
     """See `name_nearby_rule`."""
@@ -199,13 +196,11 @@ def evaluate_off_policy(
     n_items, in_catalogue = len(trained.items), steps.groups.number >= 0
     logs = WeighedLogs(
         steps,
+        logged,
         columns,
         segment=1 + np.searchsorted(quartiles, times, side="right"),
         declared=declared,
-        fingerprint=store.record.fingerprint,
         models=models,
-        measures=logged.measures,
-        groups=logged.groups,
         traffic=Traffic(
             days=float(np.ptp(times)) / DAY_MS,
             users=len(np.unique(steps.users)),
@@ -214,7 +209,7 @@ def evaluate_off_policy(
         ),
         nearby=name_nearby_rule(trained, rule),
     )
-    _doubt_logs(logs, logged)
+    _doubt_logs(logs)
     implied = None if declared else check_catalogue_size(steps, in_catalogue, n_items)
     if implied is not None and not implied.passed:
         logs.forbidden.append(
@@ -285,7 +280,7 @@ def _make_report(
             "choice": "softmax" if rule.draws else "greedy",
         },
         config_hash=config_hash(record.settings),
-        data_fingerprint=logs.fingerprint,
+        data_fingerprint=logs.logged.store.record.fingerprint,
         metric="R_cum",
         metrics={},
         target_return=rule.target,
@@ -360,11 +355,11 @@ def _add_evidence(
     rows, terms = replace(logs.steps, positions=steps.positions), None
     if verdict.estimator is not None:
         terms = session_terms(steps.weighable)[verdict.estimator].influences
-        if logs.groups is not None:
+        if (groups := logs.logged.groups) is not None:
             lifts = terms - steps.weighable.returns
-            verdict = replace(verdict, groups=compare_groups(logs.groups, rows, lifts, seed))
+            verdict = replace(verdict, groups=compare_groups(groups, rows, lifts, seed))
     guardrails = [
-        check_guardrail(text, logs.measures[measure], rows, verdict.reasons, seed)
+        check_guardrail(text, logs.logged.measures[measure], rows, verdict.reasons, seed)
         for text, measure in zip(options.guardrails, options.measures, strict=True)
     ]
     verdict = replace(verdict, guardrails=guardrails)
@@ -402,9 +397,9 @@ def _make_rows(
     return rows
 
 
-def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions) -> None:
+def _doubt_logs(logs: WeighedLogs) -> None:
     """Add what rows seen in training, of unknown items, and dropped rows say."""
-    seen, dropped = logs.columns["seen_in_training"], logged.report["dropped"]
+    seen, logged = logs.columns["seen_in_training"], logs.logged
     logs.forbidden += seen_too_often(seen)
     if seen is None:
         logs.remarks.append(
@@ -416,7 +411,7 @@ def _doubt_logs(logs: WeighedLogs, logged: LoggedSessions) -> None:
             f"{logged.unknown_items:,} rows show items that the run does not know, and so never "
             "would: they weigh 0"
         )
-    if without_reward := dropped.get("reward_not_finite", 0):
+    if without_reward := logged.report["dropped"].get("reward_not_finite", 0):
         rows = logged.store.n_steps + without_reward
         much = without_reward > MOST_LEFT_OUT * rows
         (logs.forbidden if much else logs.remarks).append(

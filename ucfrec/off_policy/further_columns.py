@@ -121,6 +121,6 @@ def _read_values(
     bound, by = bind(connection, table, key, id_), bind(connection, table, "--by", column)
     texts = bound.columns if bound.is_column else ()
     text = table.text_of(texts[0]) if texts else f"CAST({bound.sql} AS VARCHAR)"
-    source = table.with_texts([*bound.columns, *by.columns], texts).sql
+    source = table.add_texts([*bound.columns, *by.columns], texts).sql
     pairs = f"SELECT DISTINCT {text} AS id, CAST({by.sql} AS VARCHAR) AS value FROM {source}"
     return connection.execute(f"FROM ({pairs}) WHERE id IS NOT NULL AND value IS NOT NULL").df()

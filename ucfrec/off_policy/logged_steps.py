@@ -221,12 +221,6 @@ class LoggedSteps:
         earlier[self.first] = 1.0
         return earlier
 
-    def step_totals(self) -> Float64Array:
-        """(T,) Σ_i w_it by step of the longest session, ended sessions with their last weight."""
-        alive = np.bincount(self.step, self.weights)
-        ended = np.bincount(self.lengths, self.session_weights, len(alive) + 1)
-        return np.asarray(alive + np.cumsum(ended)[:-1])
-
     @cached_property
     def weighable(self) -> "LoggedSteps":
         """The sessions of whose every step the propensity is known, renumbered; there is one."""

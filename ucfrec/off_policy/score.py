@@ -9,7 +9,6 @@ from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import pyarrow.parquet as pq
 import torch
@@ -25,7 +24,6 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.logs.rows import mix_bits
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.logs.summary import note_unknown
 from ucfrec.off_policy.further_columns import read_groups, read_measure
@@ -45,8 +43,6 @@ HISTORY_LACKING = (
     "the store of the run is gone or has changed: users are ranked without what they were shown "
     "before these logs; move the run together with its store"
 )
-
-KeyArray = npt.NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -315,8 +311,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     # The training data may be far larger than the logs.
     for name in schema.SPLITS if trained.record.refit_of is not None else ("train", "validation"):
         for trained_keys in _hash_rows(store.split(name)):
-            places = np.minimum(np.searchsorted(keys, trained_keys), len(keys) - 1)
-            seen[places[keys[places] == trained_keys]] = True
+            seen |= np.isin(keys, trained_keys)
     return float(rows[seen].sum() / rows.sum())
 
 
@@ -337,14 +332,12 @@ def seen_too_often(seen: float | None) -> list[str]:
     return [text] if seen is not None and seen > MOST_SEEN else []
 
 
-def _hash_rows(store: EpisodeStore) -> Iterator[KeyArray]:
+def _hash_rows(store: EpisodeStore) -> Iterator[Array]:
     """(N,) hash of each step's numbers of user and item, and its time (ms); some steps at a time,
     in order."""
     users: Array = store.episode_values(schema.USER)
     for episodes, steps in store.step_batches() if store.n_episodes else ():
-        items = store.step_values(schema.ITEM, episodes, steps)
-        times = store.step_values(schema.TIMESTAMP, episodes, steps)
-        keys = np.zeros(len(steps), dtype=np.uint64)
-        for values in (users[episodes], items, times):
-            keys = mix_bits(keys ^ values.astype(np.int64).view(np.uint64))
-        yield keys
+        names = (schema.ITEM, schema.TIMESTAMP)
+        rows = pd.DataFrame({name: store.step_values(name, episodes, steps) for name in names})
+        rows = rows.assign(user=users[episodes]).astype(np.int64)
+        yield pd.util.hash_pandas_object(rows, index=False).to_numpy()

@@ -95,7 +95,7 @@ def _conclude_estimates(rows: Sequence[ResultRow]) -> list[Finding]:
             for caption, columns in (("Estimates", _OF_SESSION), ("Estimates per step", _OF_STEP))
             if (group := [r for r in call if r.metric == columns[0]])
         ]
-        answer = answer_of(row)
+        answer = str(row.details.get("verdict", "The rows have no verdict of ucfrec ope"))
         if len(calls) > 1 and row.details.get("reliable") is not True:
             # The reasons are among the warnings.
             answer = answer.partition(":")[0]
@@ -122,11 +122,6 @@ def _tabulate_parts(caption: str, parts: Sequence[Mapping[str, Any]]) -> Table:
                 cells[place] = Interval(name, cell["value"], cell["low"], cell["high"]).numbers
         body.append((str(name), cells))
     return Table(caption, list(parts[0])[1:], body)
-
-
-def answer_of(row: ResultRow) -> str:
-    """What `ucfrec ope` concluded of a policy, as its rows say."""
-    return str(row.details.get("verdict", "The rows have no verdict of ucfrec ope"))
 
 
 def _conclude_rows(place: str, rows: Sequence[ResultRow]) -> Finding:

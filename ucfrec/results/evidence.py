@@ -28,14 +28,14 @@ class Evidence:
         """Whether there is an interval, and no reason against it."""
         return not self.reasons and self.interval is not None
 
-    def standing(self, margin: float = 0.0) -> Relation:
-        """What a difference shows of the first against the second: level if it is at most `margin`,
+    def standing(self) -> Relation:
+        """What a difference shows of the first against the second: level if it is 0 throughout,
         open if it is not reliable or may be either."""
         if not self.is_reliable or self.low is None or self.high is None:
             return "open"
         if self.low > 0 or self.high < 0:
             return "better" if self.low > 0 else "worse"
-        return "level" if -margin <= self.low and self.high <= margin else "open"
+        return "level" if self.low == self.high else "open"
 
     def format(self, number: str = "+.3g") -> str:
         """The value with its interval, as `number` formats them; – where a reason forbids it."""

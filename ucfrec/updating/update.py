@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
-from ucfrec.choosing.choice import RuleConfig
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import lock_path
@@ -37,12 +35,6 @@ class UpdateOptions:
     allow_argmax: bool = False
     """Let a decision rule that draws items become one that takes the best, after which new logs
     have no propensities to evaluate from."""
-
-
-def _keep_drawing(config: RuleConfig, rule: DecisionRule) -> RuleConfig:
-    """How to choose a rule that draws items where the rule before did."""
-    drawing = tuple(value for value in config.temperatures if value > 0 or not rule.temperature)
-    return replace(config, temperatures=drawing or (rule.temperature,))
 
 
 @random_state_kept()
@@ -99,8 +91,10 @@ def update_run(
         settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
     config = warm_settings(full)
-    if not options.allow_argmax:
-        config = replace(config, rule=_keep_drawing(config.rule, trained.rule))
+    if (temperature := trained.rule.temperature) and not options.allow_argmax:
+        drawing = tuple(value for value in config.rule.temperatures if value > 0)
+        rule = replace(config.rule, temperatures=drawing or (temperature,))
+        config = replace(config, rule=rule)
     update = Update(
         of=run.resolve().name,
         run=trained.fingerprint,

@@ -237,6 +237,8 @@ def test_equal_rewards_are_learned_as_a_ranking(log: pd.DataFrame, tmp_path: Pat
     assert record.ranking is not None
     assert 0 < record.ranking.ndcg < record.ranking.hits < 1
     assert "NDCG@10" in record.describe()
+    card = (tmp_path / "run" / "MODEL_CARD.md").read_text(encoding="utf-8")
+    assert "NDCG@10 on validation rows" in card
     assert policy.recommend(log.assign(reward=1.0), k=2).groupby("user_id").size().eq(2).all()
 
 

@@ -35,6 +35,7 @@ def write_card(run: Path) -> Path:
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
     fit, times, splits = record.policy, record.data.time_range_ms, record.data.split_times_ms
+    ranking = record.ranking
     if times and splits and not refitted:
         times = times[0], min(splits[0], times[1])
     window = [f"{datetime.fromtimestamp(time / 1000, UTC):%Y-%m-%d %H:%M}" for time in times or ()]
@@ -49,6 +50,8 @@ def write_card(run: Path) -> Path:
                 "seed": record.seed,
                 "training steps of the model": fit and fit.steps,
                 "best validation loss": fit and fit.best_validation,
+                "NDCG@10 on validation rows": ranking and ranking.ndcg,
+                "that of items shown most lately": ranking and ranking.baseline_ndcg,
                 "versions": ", ".join(f"{name} {n}" for name, n in record.versions.items()),
             }
         ),
@@ -232,6 +235,8 @@ def describe_user_model(record: RunRecord) -> dict[str, object]:
         "reward: loss of item effects": reward.item_loss,
         "reward: loss of the model": reward.loss,
     }
+    if reward.half_life is not None:
+        rows["reward: rows count half after"] = f"{reward.half_life:g} hours"
     for effect in reward.effects:
         excluded = "" if effect.kept else ", excluded"
         rows[f"gain by {effect.effect}"] = f"{effect.gain:.5f} ± {effect.gain_error:.5f}{excluded}"

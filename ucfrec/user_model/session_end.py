@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pydantic
@@ -41,7 +42,8 @@ _HIGHEST = 20.0
 TREES = 100
 LEAVES = 8
 """Most trees, and leaves of a tree."""
-_SETTINGS = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
+_SETTINGS: dict[str, Any] = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
+_SETTINGS["early_stopping"] = True
 _SPLITS = LEAVES - 1
 _LOGISTIC = ("highest", "mean", "scale", "weights", "bias")
 
@@ -330,18 +332,29 @@ class BoostedTrees:
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) from inputs (M, F)."""
+        return self._base + self._find_leaves(inputs).sum(0)
+
+    def stages(self, inputs: Tensor) -> Tensor:
+        """Log-odds (T, M) from inputs (M, F) by the first tree, the first two, and so on."""
+        return self._base + self._find_leaves(inputs).cumsum(0)
+
+    def _find_leaves(self, inputs: Tensor) -> Tensor:
         at_most = torch.le(inputs.double().T[self._numbers], self._thresholds).float()
         # Numbers of leaves, which float32 has exactly.
-        columns = (self._bits @ at_most).long()
-        return self._base + self._leaves.gather(1, columns).sum(0)
+        return self._leaves.gather(1, (self._bits @ at_most).long())
 
 
-def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
-    """Tensors of `BoostedTrees` of a bool target (M,), from inputs (M, F), of scikit-learn; a tenth
-    of the rows, drawn by `seed`, decides when to stop."""
+def fit_trees(
+    inputs: Array,
+    target: Array,
+    seed: int,
+    **settings: Any,
+) -> dict[str, Tensor]:
+    """Tensors of `BoostedTrees` of a bool target (M,), from inputs (M, F), of scikit-learn, with
+    its `settings`; by default, a tenth of the rows, drawn by `seed`, decides when to stop."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
-    model = HistGradientBoostingClassifier(early_stopping=True, random_state=seed, **_SETTINGS)
+    model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS | settings)
     model.fit(inputs, target)
     tables = [_tabulate(trees[0].nodes) for trees in model._predictors]
     splits, thresholds, leaves = (

@@ -321,14 +321,9 @@ class BoostedTrees:
         (T, S), the `base` () of the sum, and `leaves` (T, 2^S) by numbers whose bit s is set where
         split s finds an input that is at most its threshold."""
         self._leaves, self._base = leaves, base
-        pairs = torch.stack([inputs.double(), thresholds], 2).flatten(0, 1)
-        splits, which = torch.unique(pairs, dim=0, return_inverse=True)
-        powers = (2.0 ** torch.arange(inputs.shape[1])).expand(inputs.shape)
-        bits = torch.zeros(len(inputs), len(splits))
-        self._bits = bits.scatter_add_(1, which.view(inputs.shape), powers)
-        """(T, U) float32 bits of the columns' numbers that each of the U different splits sets."""
-        self._numbers, self._thresholds = splits[:, 0].long(), splits[:, 1:]
-        """Input (U,) and threshold (U, 1) of these splits."""
+        self._powers = 2.0 ** torch.arange(inputs.shape[1])
+        # First splits of all trees, second ones, and so on.
+        self._numbers, self._thresholds = inputs.T.flatten(), thresholds.T.reshape(-1, 1)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) from inputs (M, F)."""
@@ -339,9 +334,12 @@ class BoostedTrees:
         return self._base + self._find_leaves(inputs).cumsum(0)
 
     def _find_leaves(self, inputs: Tensor) -> Tensor:
-        at_most = torch.le(inputs.double().T[self._numbers], self._thresholds).float()
+        """(T, M) values of the trees' leaves."""
+        columns = inputs.double().T.contiguous()
+        at_most = torch.le(columns[self._numbers], self._thresholds).float()
+        at_most = at_most.unflatten(0, (len(self._powers), len(self._leaves)))
         # Numbers of leaves, which float32 has exactly.
-        return self._leaves.gather(1, (self._bits @ at_most).long())
+        return self._leaves.gather(1, torch.tensordot(self._powers, at_most, 1).long())
 
 
 def fit_trees(

@@ -39,15 +39,14 @@ _HALVINGS = 30
 _MAX_ROWS = 300_000
 _ROWS_AT_ONCE = 4096
 _FOLDS = 5
-_HELD_OUT = 10
-"""Without validation episodes, one in this many says how many trees are best."""
 _LEARNING_RATE = 0.1
-_PENALTIES = (300.0, 1000.0, 3000.0, 10_000.0)
-"""Steps that L2 penalties of the regression on pairs of attributes count as."""
+_PENALTY = 1000.0
+"""L2 penalty of the regression on pairs of attributes."""
 _PAIRS = 10
 """Number of the input that is the sum of the effects of pairs of attributes."""
 _DECIMALS = 3
 _SPLITS = LEAVES - 1
+_TABLES = ("inputs", "thresholds", "leaves")
 
 _Scored = Literal["steps", "likes", "rate"]
 LikedOf = Callable[[EpisodeStore, Array], BoolArray]
@@ -336,7 +335,7 @@ class BoostedPolicy(ScoringPolicy):
     likeness of the item to the session's, effects of pairs of attributes, and the attributes. In
     training, rates and effects are those of other folds of the episodes, because its own row would
     tell the trees what they predict. Their number has the lowest loss on validation episodes, or on
-    a tenth of the training episodes without these. Returns are not used.
+    a fifth of the training episodes without these. Returns are not used.
     """
 
     Config = BoostedConfig
@@ -349,18 +348,14 @@ class BoostedPolicy(ScoringPolicy):
     liked: Tensor
     directions: Tensor
     tag: Tensor
-    split_inputs: Tensor
-    split_thresholds: Tensor
-    leaves: Tensor
     base: Tensor
     trees: Tensor
     effects: Tensor
 
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        n_items, splits = sizes["items"], (_SPLITS, TREES)
+        n_items, splits = sizes["items"], (TREES, _SPLITS)
         self._context = 3 * sizes["action"] + 2
-        """Number of the first entry of a state that is of the user or observed."""
         for name, value in (
             ("reward_low", torch.zeros(())),
             ("reward_high", torch.zeros(())),
@@ -368,9 +363,9 @@ class BoostedPolicy(ScoringPolicy):
             ("liked", torch.zeros(n_items)),
             ("directions", torch.zeros(n_items, sizes["action"])),
             ("tag", torch.arange(n_items)),
-            ("split_inputs", torch.zeros(splits, dtype=torch.int64)),
-            ("split_thresholds", torch.zeros(splits)),
-            ("leaves", torch.zeros(TREES, 2**_SPLITS)),
+            ("tree_inputs", torch.zeros(splits, dtype=torch.int64)),
+            ("tree_thresholds", torch.zeros(splits)),
+            ("tree_leaves", torch.zeros(TREES, 2**_SPLITS)),
             ("base", torch.zeros(())),
             ("trees", torch.zeros((), dtype=torch.int64)),
             ("effects", torch.zeros(n_items, 1 + sizes["state"] - self._context)),
@@ -401,24 +396,22 @@ class BoostedPolicy(ScoringPolicy):
         def solve() -> None:
             numbers = draw_numbers(train.n_steps, _MAX_ROWS, seed)
             inputs, liked = self._training_rows(train, numbers)
-            held_out = None
+            held_out, count = None, 0 if validation is not None else int(self.trees)
             if validation is not None:
-                numbers = draw_numbers(validation.n_steps, _MAX_ROWS, seed)
-                held_out = self._rows(validation, numbers)
-            elif not self.trees:
-                rows = train.locate(numbers)[0] % _HELD_OUT == 0
+                later = draw_numbers(validation.n_steps, _MAX_ROWS, seed)
+                held_out = self._rows(validation, later)
+            elif not count:
+                rows = train.locate(numbers)[0] % _FOLDS == _FOLDS - 1
                 held_out = inputs[rows], liked[rows]
                 inputs, liked = inputs[~rows], liked[~rows]
-            count = TREES if held_out else int(self.trees)
-            settings = {"max_iter": count, "learning_rate": _LEARNING_RATE, "early_stopping": False}
-            tables = fit_trees(inputs, liked, seed, **settings)
-            if held_out:
+            settings = {"learning_rate": _LEARNING_RATE, "early_stopping": False}
+            tables = fit_trees(inputs, liked, seed, max_iter=count or TREES, **settings)
+            if held_out is not None:
                 count = _best_number(BoostedTrees(**tables), *held_out)
             self.trees.fill_(count)
             self.base.copy_(tables["base"])
-            self.leaves[:count] = tables["leaves"][:count]
-            self.split_inputs[:, :count] = tables["inputs"][:count].T
-            self.split_thresholds[:, :count] = tables["thresholds"][:count].T
+            for name in _TABLES:
+                self.get_buffer(f"tree_{name}")[:count] = tables[name][:count]
 
         return solve
 
@@ -429,17 +422,15 @@ class BoostedPolicy(ScoringPolicy):
         parts = (train.select(np.flatnonzero(folds == fold)) for fold in range(_FOLDS))
         of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
         whole = torch.stack([self.impressions, self.liked]).cpu()
-        counts = whole.unsqueeze(1) - torch.stack(of_folds, 1)  # (2, folds, n_items) of the others
-        inputs, liked = self._rows(train, numbers, counts, folds)
+        # (2, folds, n_items) of the others.
+        inputs, liked = self._rows(train, numbers, whole.unsqueeze(1) - torch.stack(of_folds, 1))
         episodes, steps = train.locate(numbers)
-        context = inputs[:, _PAIRS + 1 :][:, : self.effects.shape[1] - 1]
-        scores, effects = _fit_pairs(
-            train.item_states.tags.numpy().reshape(len(self.tag), -1),
-            train.step_values(schema.ITEM, episodes, steps).astype(np.int64),
-            np.insert(context.astype(np.float64), 0, 1.0, axis=1),
-            liked - 1 / (1 + np.exp(-inputs[:, 0])),
-            folds[episodes],
-        )
+        items = train.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        tags = train.item_states.tags.numpy().reshape(len(self.tag), -1)
+        inputs[:, _PAIRS] = 1  # before the context
+        context = inputs[:, _PAIRS : _PAIRS + self.effects.shape[1]].astype(np.float64)
+        residuals = liked - 1 / (1 + np.exp(-inputs[:, 0]))
+        scores, effects = _fit_pairs(tags, items, context, residuals, folds[episodes])
         inputs[:, _PAIRS] = scores.round(_DECIMALS)
         self.effects.copy_(torch.from_numpy(effects))
         return inputs, liked
@@ -449,18 +440,17 @@ class BoostedPolicy(ScoringPolicy):
         view: EpisodeStore,
         numbers: IntArray,
         counts: Tensor | None = None,
-        folds: IntArray | None = None,
     ) -> tuple[Array, BoolArray]:
         """Inputs (M, F) of the trees at steps (M,) of a view, and which were liked; with counts
-        (2, folds, n_items) of shown and liked ones for each of the `folds` (E,) of its episodes."""
+        (2, folds, n_items) of shown and liked ones for each fold of its episodes."""
         inputs, target, device = [], [], self.impressions.device
         for begin in range(0, len(numbers), _ROWS_AT_ONCE):
             episodes, steps = view.locate(numbers[begin : begin + _ROWS_AT_ONCE])
             windows = view.windows(episodes, steps, self.config.context)
             items, of_items = windows.actions[:, -1:], None
-            if counts is not None and folds is not None:
-                of_items = counts[:, torch.from_numpy(folds[episodes]).unsqueeze(1), items]
-                of_items = of_items.to(device)
+            if counts is not None:
+                folds = torch.from_numpy(episodes % _FOLDS).unsqueeze(1)
+                of_items = counts[:, folds, items].to(device)
             rows = self._inputs(windows.to(device), items.to(device), of_items)
             inputs.append(rows[:, 0].cpu().numpy())
             rewards = view.step_values(schema.REWARD, episodes, steps)
@@ -520,17 +510,16 @@ class BoostedPolicy(ScoringPolicy):
             tagged,
             _round(pairs),
         )
+        rates = torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
         attributes = (context, self.directions[items])
-        parts = [torch.stack([weights.expand_as(none) for weights in columns], dim=-1)]
-        parts += [values.expand(*none.shape, -1) for values in attributes]
-        return torch.cat(parts, dim=-1)
+        return torch.cat([rates, *(part.expand(*none.shape, -1) for part in attributes)], dim=-1)
 
     def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
-        tables = (self.split_inputs.T, self.split_thresholds.T, self.leaves)
-        inner, thresholds, leaves = (table[: int(self.trees)].cpu() for table in tables)
-        trees = BoostedTrees(inner, thresholds, leaves, self.base.cpu())
+        buffers = {name: self.get_buffer(f"tree_{name}") for name in _TABLES}
+        tables = {name: table[: int(self.trees)].cpu() for name, table in buffers.items()}
+        trees = BoostedTrees(**tables, base=self.base.cpu())
         parts = torch.split(inputs.flatten(0, 1).cpu(), _ROWS_AT_ONCE)
         return torch.cat([trees(rows) for rows in parts]).view(inputs.shape[:2]).to(inputs)
 
@@ -562,57 +551,39 @@ def _fit_pairs(
     folds: IntArray,
 ) -> tuple[Float64Array, Float64Array]:
     """Ridge regression of residuals (M,) of steps on all products of an entry of their context
-    (M, C), the first of which is 1, with an attribute of their item: 1, or whether it has a tag.
-
-    Context and attributes are taken as independent, so that two small decompositions solve it. The
-    penalty is the one that predicts other folds best.
-
-    Args:
-        tags: (n_items, T) as of `ItemStates`.
-        items: (M,) item of each step.
-        folds: (M,) fold of each step, from 0.
-
-    Returns:
-        Predictions (M,) from the other folds, and effects (n_items, C) of context by all of them.
-    """
+    (M, C), the first of which is 1, with 1 or a tag of their items (M,), by `tags` (n_items, T):
+    predictions (M,) from other `folds` (M,), and effects (n_items, C) of context by all of them.
+    Context and tags are taken as independent, so that two small decompositions solve it."""
     from scipy import sparse
 
     columns = np.pad(tags + 1, ((0, 0), (1, 0)))  # 0 for all items, and for no tag
-    has = (columns > 0) | (np.arange(columns.shape[1]) == 0)
+    weights = (columns > 0) | (np.arange(columns.shape[1]) == 0)
     bounds = np.arange(len(columns) + 1) * columns.shape[1]
     shape = (len(columns), int(columns.max()) + 1)
-    attributes = sparse.csr_matrix((has.ravel().astype(float), columns.ravel(), bounds), shape)
-    shown, count = attributes[items], len(items)
+    attributes = sparse.csr_matrix((weights.ravel().astype(float), columns.ravel(), bounds), shape)
+    design, weighted = attributes[items], context.T * residuals
     spread, axes = np.linalg.eigh(context.T @ context)
-    spreads, bases = np.linalg.eigh((shown.T @ shown).toarray() / count)
+    spreads, bases = np.linalg.eigh((design.T @ design).toarray() / len(items))
     variance = np.outer(spread, spreads).clip(0)
-    rows = [np.flatnonzero(folds == fold) for fold in range(_FOLDS)]
-    weighted = context * residuals[:, None]
-    moments = np.stack([axes.T @ (shown[part].T @ weighted[part]).T @ bases for part in rows])
 
-    def solve(sums: Float64Array, share: float, penalty: float) -> Float64Array:
-        slopes = axes @ (sums / (share * variance + penalty)) @ bases.T
+    def solve(rows: BoolArray) -> Float64Array:
+        moments = axes.T @ (weighted[:, rows] @ design[rows]) @ bases
+        slopes = axes @ (moments / (rows.mean() * variance + _PENALTY)) @ bases.T
         return np.asarray(attributes @ slopes.T)
 
-    total, best, lowest = moments.sum(0), _PENALTIES[-1], math.inf
-    scores = np.zeros(count)
-    for penalty in _PENALTIES:
-        predicted = np.zeros(count)
-        for part, sums in zip(rows, moments, strict=True):
-            effects = solve(total - sums, 1 - len(part) / count, penalty)
-            predicted[part] = (effects[items[part]] * context[part]).sum(1)
-        loss = float(((predicted - residuals) ** 2).sum())
-        if loss < lowest:
-            best, lowest, scores = penalty, loss, predicted
-    return scores, solve(total, 1.0, best)
+    predicted = np.zeros(len(items))
+    for fold in range(_FOLDS):
+        rows = folds == fold
+        predicted[rows] = (solve(~rows)[items[rows]] * context[rows]).sum(1)
+    return predicted, solve(folds >= 0)
 
 
 def _best_number(trees: BoostedTrees, inputs: Array, liked: BoolArray) -> int:
     """How many of the trees have the lowest log loss at held-out steps."""
-    total = torch.zeros(())
+    losses = torch.zeros(())
     for begin in range(0, len(inputs), _ROWS_AT_ONCE):
         rows = slice(begin, begin + _ROWS_AT_ONCE)
         odds = trees.stages(torch.from_numpy(inputs[rows]))
-        target = torch.from_numpy(liked[rows]).to(odds).expand_as(odds)
-        total = total + F.binary_cross_entropy_with_logits(odds, target, reduction="none").sum(1)
-    return 1 + int(total.argmin())
+        signed = torch.where(torch.from_numpy(liked[rows]), -odds, odds)
+        losses = losses + F.softplus(signed).sum(1)
+    return 1 + int(losses.argmin())

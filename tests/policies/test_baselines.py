@@ -13,10 +13,13 @@ from tests.support.tagged import tagged_store
 from ucfrec.commands.cli import main
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.policies.baselines import (
+    _PENALTY,
     BoostedPolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
+    _fit_pairs,
     shrink_rates,
 )
 from ucfrec.results.rows import read_results
@@ -146,10 +149,90 @@ def test_a_row_does_not_tell_the_trees_what_they_predict(
 ) -> None:
     """The rate of an item is the same in a fold whether the row itself was liked or not."""
     policy, store = fitted
-    inputs, liked = policy._rows(store, np.arange(store.n_steps))
+    inputs, liked = policy._training_rows(store, np.arange(store.n_steps))
     episodes, _ = store.all_steps()
     items = store.column("item")
     for item in range(3):
         rows = (items == item) & (episodes % 5 == 0)
         assert len(np.unique(inputs[rows, 0])) == 1
         assert {*liked[rows].tolist()} == {True, False}
+
+
+def test_effects_of_pairs_are_a_ridge_regression_on_other_folds() -> None:
+    """Where every fold has all pairs of two user attributes and six items equally often."""
+    rng, tags = (
+        np.random.default_rng(0),
+        np.array([[0, -1], [1, -1], [0, 1], [2, 0], [-1, -1], [2, 1]]),
+    )
+    kinds, items, folds = (values.ravel() for values in np.indices((2, 6, 5)).repeat(40, axis=1))
+    context = np.column_stack([np.ones(len(kinds)), 2.0 * kinds - 1])
+    has_tag = (tags[:, :, None] == np.arange(3)).any(axis=1)
+    attributes = np.insert(has_tag.astype(float), 0, 1.0, axis=1)[items]
+    residuals = 0.3 * context[:, 1] * attributes[:, 2] + rng.normal(size=len(kinds))
+    predicted, effects = _fit_pairs(tags, items, context, residuals, folds)
+    pairs = (context[:, :, None] * attributes[:, None, :]).reshape(len(kinds), -1)
+    gram, others = pairs[folds != 0].T @ pairs[folds != 0], residuals[folds != 0]
+    penalised = gram + _PENALTY * np.eye(len(gram))
+    slopes = np.linalg.solve(penalised, pairs[folds != 0].T @ others)
+    np.testing.assert_allclose(predicted[folds == 0], pairs[folds == 0] @ slopes, atol=1e-12)
+    assert effects[1, 1] - effects[0, 1] > 0.1
+
+
+def attribute_store(folder: Path, effect: float) -> EpisodeStore:
+    """Users of two groups in short sessions; by an effect, each likes the items of one tag."""
+    rng, n = np.random.default_rng(0), 12_000
+    log = pd.DataFrame({"user_id": rng.integers(1000, size=n), "item_id": rng.integers(30, size=n)})
+    own = log.user_id % 2 == log.item_id % 2
+    log["reward"] = (rng.random(n) < np.where(own, 0.4 + effect, 0.4 - effect)).astype(float)
+    log["timestamp"] = 1_700_000_000_000 + 60_000 * np.arange(n)
+    names = [["red", "blue"][number % 2] for number in range(1000)]
+    users = pd.DataFrame({"user_id": range(1000), "group": names})
+    items = pd.DataFrame({"item_id": range(30), "tags": [[name] for name in names[:30]]})
+    tables = []
+    for frame in (users, items):
+        frame.to_parquet(folder / f"{frame.columns[0]}.parquet")
+        tables.append((FeatureTable((folder / f"{frame.columns[0]}.parquet",), frame.columns[0]),))
+    mapping = LogMapping(user_features=tables[0], item_features=tables[1])
+    options = {"session_by": "user", "embedding_size": 4, "split": (0.5, 0.4, 0.1)}
+    return store_of(log, folder, mapping, reward="reward", **options)
+
+
+def fit_boosted(store: EpisodeStore) -> BoostedPolicy:
+    train = store.split("train")
+    policy = new_policy(train, resolve_config("boosted", None, {"policy.context": 4})).eval()
+    policy.start_from(train)
+    policy.make_solver(train, store.split("validation"), Path(), 0)()
+    return policy
+
+
+def test_users_with_an_attribute_get_items_with_the_tag_they_like(tmp_path: Path) -> None:
+    store = attribute_store(tmp_path, effect=0.25)
+    policy, test = fit_boosted(store), store.split("test")
+    episodes = np.arange(test.n_episodes)
+    windows = test.windows(episodes, np.zeros_like(episodes), 4)  # without history
+    scores, group = policy.act(windows), windows.states[:, -1, -1].numpy() > 0
+    tagged = store.item_states.tags[:, 0] == 0
+    gain = (scores[:, tagged].mean(1) - scores[:, ~tagged].mean(1)).numpy()
+    shown, rewards = tagged.numpy()[test.column("item")], test.column("reward")
+    of_rows = group[test.all_steps()[0]]
+    for value in (False, True):
+        rows = of_rows == value
+        liked = rewards[rows & shown].mean() - rewards[rows & ~shown].mean()
+        assert (np.sign(liked) * gain[group == value]).min() > 0.5
+
+
+def test_noise_grows_few_trees_and_a_refit_keeps_their_number(tmp_path: Path) -> None:
+    numbers = []
+    for effect in (0.0, 0.25):
+        (tmp_path / str(effect)).mkdir()
+        store = attribute_store(tmp_path / str(effect), effect)
+        policy = fit_boosted(store)
+        numbers.append(int(policy.trees))
+        refit = new_policy(
+            store.split("train"), resolve_config("boosted", None, {"policy.context": 4})
+        )
+        refit.start_from(store.split("train"))
+        refit.trees.copy_(policy.trees)
+        refit.make_solver(store.split("train"), None, Path(), 0)()
+        torch.testing.assert_close(refit.state_dict(), policy.state_dict())
+    assert numbers[0] < 10 < numbers[1]

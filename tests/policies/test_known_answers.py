@@ -16,8 +16,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 KINDS, STEPS, SESSIONS = 4, 3, 400
 KNOWS_NOBODY = ("popular", "item-rate", "recent-clicks", "recent-rate")
-SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "boosted")
-ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:])
+SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn")
+ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:], "boosted")
 SETTINGS = [
     *("train.steps=45", "train.validate_every=45", "train.learning_rate=0.01"),
     *("train.warmup_steps=0", "train.batch_size=64", "policy.context=3", "policy.dim=16"),

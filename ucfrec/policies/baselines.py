@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown, Windows
-from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy
+from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, standardise
 from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
@@ -39,8 +39,14 @@ _HALVINGS = 30
 _MAX_ROWS = 300_000
 _ROWS_AT_ONCE = 4096
 _FOLDS = 5
+_LEARNING_RATE = 0.1
+_PENALTY = 1000.0
+"""L2 penalty of the regression on pairs of attributes."""
+_PAIRS = 10
+"""Number of the input that is the sum of the effects of pairs of attributes."""
 _DECIMALS = 3
 _SPLITS = LEAVES - 1
+_TABLES = ("inputs", "thresholds", "leaves")
 
 _Scored = Literal["steps", "likes", "rate"]
 LikedOf = Callable[[EpisodeStore, Array], BoolArray]
@@ -325,29 +331,31 @@ class BoostedConfig(PolicyConfig):
 class BoostedPolicy(ScoringPolicy):
     """Scores items by the log-odds of a like, predicted by gradient-boosted trees.
 
-    The trees (scikit-learn's histogram boosting) see the columns of `_inputs`: rates, counts, and
-    the likeness of the item to the session's. In training, an item's rate is that of other folds of
-    the episodes, because its own row would tell the trees what they predict. States and returns are
-    not used.
+    The trees (scikit-learn's histogram boosting) see the columns of `_inputs`: rates, counts, the
+    likeness of the item to the session's, effects of pairs of attributes, and the attributes. In
+    training, rates and effects are those of other folds of the episodes, because its own row would
+    tell the trees what they predict. Their number has the lowest loss on validation episodes, or on
+    a fifth of the training episodes without these. Returns are not used.
     """
 
     Config = BoostedConfig
     config: BoostedConfig
     items_only = "boosted"
+    chosen = ("trees",)
     reward_low: Tensor
     reward_high: Tensor
     impressions: Tensor
     liked: Tensor
     directions: Tensor
     tag: Tensor
-    split_inputs: Tensor
-    split_thresholds: Tensor
-    leaves: Tensor
     base: Tensor
+    trees: Tensor
+    effects: Tensor
 
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        n_items, splits = sizes["items"], (_SPLITS, TREES)
+        n_items, splits = sizes["items"], (TREES, _SPLITS)
+        self._context = 3 * sizes["action"] + 2
         for name, value in (
             ("reward_low", torch.zeros(())),
             ("reward_high", torch.zeros(())),
@@ -355,10 +363,12 @@ class BoostedPolicy(ScoringPolicy):
             ("liked", torch.zeros(n_items)),
             ("directions", torch.zeros(n_items, sizes["action"])),
             ("tag", torch.arange(n_items)),
-            ("split_inputs", torch.zeros(splits, dtype=torch.int64)),
-            ("split_thresholds", torch.zeros(splits)),
-            ("leaves", torch.zeros(TREES, 2**_SPLITS)),
+            ("tree_inputs", torch.zeros(splits, dtype=torch.int64)),
+            ("tree_thresholds", torch.zeros(splits)),
+            ("tree_leaves", torch.zeros(TREES, 2**_SPLITS)),
             ("base", torch.zeros(())),
+            ("trees", torch.zeros((), dtype=torch.int64)),
+            ("effects", torch.zeros(n_items, 1 + sizes["state"] - self._context)),
         ):
             self.register_buffer(name, value)
 
@@ -384,34 +394,67 @@ class BoostedPolicy(ScoringPolicy):
         """Fits the trees."""
 
         def solve() -> None:
-            inputs, liked = self._rows(train, draw_numbers(train.n_steps, _MAX_ROWS, seed))
-            trees = fit_trees(inputs, liked, seed)
-            self.base.copy_(trees["base"])
-            count = len(trees["leaves"])
-            self.leaves[:count] = trees["leaves"]
-            self.split_inputs[:, :count] = trees["inputs"].T
-            self.split_thresholds[:, :count] = trees["thresholds"].T
+            numbers = draw_numbers(train.n_steps, _MAX_ROWS, seed)
+            inputs, liked = self._training_rows(train, numbers)
+            held_out, count = None, 0 if validation is not None else int(self.trees)
+            if validation is not None:
+                later = draw_numbers(validation.n_steps, _MAX_ROWS, seed)
+                held_out = self._rows(validation, later)
+            elif not count:
+                rows = train.locate(numbers)[0] % _FOLDS == _FOLDS - 1
+                held_out = inputs[rows], liked[rows]
+                inputs, liked = inputs[~rows], liked[~rows]
+            settings = {"learning_rate": _LEARNING_RATE, "early_stopping": False}
+            tables = fit_trees(inputs, liked, seed, max_iter=count or TREES, **settings)
+            if held_out is not None:
+                count = _best_number(BoostedTrees(**tables), *held_out)
+            self.trees.fill_(count)
+            self.base.copy_(tables["base"])
+            for name in _TABLES:
+                self.get_buffer(f"tree_{name}")[:count] = tables[name][:count]
 
         return solve
 
-    def _rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
-        """Inputs (M, F) of the trees at training steps (M,), and which were liked."""
+    def _training_rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
+        """Inputs (M, F) of the trees at training steps (M,), from other folds of the episodes, and
+        which were liked; sets the effects of pairs of attributes to those of all folds."""
         folds = np.arange(train.n_episodes) % _FOLDS
         parts = (train.select(np.flatnonzero(folds == fold)) for fold in range(_FOLDS))
         of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
         whole = torch.stack([self.impressions, self.liked]).cpu()
-        counts = whole.unsqueeze(1) - torch.stack(of_folds, 1)  # (2, folds, n_items) of the others
-        inputs, target = [], []
+        # (2, folds, n_items) of the others.
+        inputs, liked = self._rows(train, numbers, whole.unsqueeze(1) - torch.stack(of_folds, 1))
+        episodes, steps = train.locate(numbers)
+        items = train.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        tags = train.item_states.tags.numpy().reshape(len(self.tag), -1)
+        inputs[:, _PAIRS] = 1  # before the context
+        context = inputs[:, _PAIRS : _PAIRS + self.effects.shape[1]].astype(np.float64)
+        residuals = liked - 1 / (1 + np.exp(-inputs[:, 0]))
+        scores, effects = _fit_pairs(tags, items, context, residuals, folds[episodes])
+        inputs[:, _PAIRS] = scores.round(_DECIMALS)
+        self.effects.copy_(torch.from_numpy(effects))
+        return inputs, liked
+
+    def _rows(
+        self,
+        view: EpisodeStore,
+        numbers: IntArray,
+        counts: Tensor | None = None,
+    ) -> tuple[Array, BoolArray]:
+        """Inputs (M, F) of the trees at steps (M,) of a view, and which were liked; with counts
+        (2, folds, n_items) of shown and liked ones for each fold of its episodes."""
+        inputs, target, device = [], [], self.impressions.device
         for begin in range(0, len(numbers), _ROWS_AT_ONCE):
-            episodes, steps = train.locate(numbers[begin : begin + _ROWS_AT_ONCE])
-            windows = train.windows(episodes, steps, self.config.context)
-            items = windows.actions[:, -1:]
-            of_items = counts[:, torch.from_numpy(folds[episodes]).unsqueeze(1), items]
-            device = self.impressions.device
-            rows = self._inputs(windows.to(device), items.to(device), of_items.to(device))
+            episodes, steps = view.locate(numbers[begin : begin + _ROWS_AT_ONCE])
+            windows = view.windows(episodes, steps, self.config.context)
+            items, of_items = windows.actions[:, -1:], None
+            if counts is not None:
+                folds = torch.from_numpy(episodes % _FOLDS).unsqueeze(1)
+                of_items = counts[:, folds, items].to(device)
+            rows = self._inputs(windows.to(device), items.to(device), of_items)
             inputs.append(rows[:, 0].cpu().numpy())
-            rewards = train.step_values(schema.REWARD, episodes, steps)
-            target.append(liked_rewards(train, rewards))
+            rewards = view.step_values(schema.REWARD, episodes, steps)
+            target.append(liked_rewards(view, rewards))
         return np.concatenate(inputs), np.concatenate(target)
 
     def _find_liked(self, windows: Windows) -> Tensor:
@@ -450,6 +493,10 @@ class BoostedPolicy(ScoringPolicy):
             (alike.float() @ weights.unsqueeze(-1)).squeeze(-1) for weights in (valid, liked)
         )
         whole = (likes + 1) / (count + 2)
+        context = standardise(windows.states, self.state_mean, self.state_std)
+        context = context[:, -1:, self._context :]  # (B, 1, F + O)
+        effects = self.effects[items]
+        pairs = effects[..., 0] + (effects[..., 1:] @ context.mT).squeeze(-1)
         columns = (
             self._rate(liked_of, shown_of),
             torch.log1p(shown_of),
@@ -461,14 +508,18 @@ class BoostedPolicy(ScoringPolicy):
             cosines[..., -1] * valid[:, -1:] if earlier.shape[1] else none,
             torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
             tagged,
+            _round(pairs),
         )
-        return torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
+        rates = torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
+        attributes = (context, self.directions[items])
+        return torch.cat([rates, *(part.expand(*none.shape, -1) for part in attributes)], dim=-1)
 
     def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
-        tables = self.split_inputs.T, self.split_thresholds.T, self.leaves, self.base
-        trees = BoostedTrees(*(table.cpu() for table in tables))
+        buffers = {name: self.get_buffer(f"tree_{name}") for name in _TABLES}
+        tables = {name: table[: int(self.trees)].cpu() for name, table in buffers.items()}
+        trees = BoostedTrees(**tables, base=self.base.cpu())
         parts = torch.split(inputs.flatten(0, 1).cpu(), _ROWS_AT_ONCE)
         return torch.cat([trees(rows) for rows in parts]).view(inputs.shape[:2]).to(inputs)
 
@@ -490,3 +541,49 @@ class BoostedPolicy(ScoringPolicy):
 
 def _round(values: Tensor) -> Tensor:
     return torch.round(values, decimals=_DECIMALS)
+
+
+def _fit_pairs(
+    tags: IntArray,
+    items: IntArray,
+    context: Float64Array,
+    residuals: Float64Array,
+    folds: IntArray,
+) -> tuple[Float64Array, Float64Array]:
+    """Ridge regression of residuals (M,) of steps on all products of an entry of their context
+    (M, C), the first of which is 1, with 1 or a tag of their items (M,), by `tags` (n_items, T):
+    predictions (M,) from other `folds` (M,), and effects (n_items, C) of context by all of them.
+    Context and tags are taken as independent, so that two small decompositions solve it."""
+    from scipy import sparse
+
+    columns = np.pad(tags + 1, ((0, 0), (1, 0)))  # 0 for all items, and for no tag
+    weights = (columns > 0) | (np.arange(columns.shape[1]) == 0)
+    bounds = np.arange(len(columns) + 1) * columns.shape[1]
+    shape = (len(columns), int(columns.max()) + 1)
+    attributes = sparse.csr_matrix((weights.ravel().astype(float), columns.ravel(), bounds), shape)
+    design, weighted = attributes[items], context.T * residuals
+    spread, axes = np.linalg.eigh(context.T @ context)
+    spreads, bases = np.linalg.eigh((design.T @ design).toarray() / len(items))
+    variance = np.outer(spread, spreads).clip(0)
+
+    def solve(rows: BoolArray) -> Float64Array:
+        moments = axes.T @ (weighted[:, rows] @ design[rows]) @ bases
+        slopes = axes @ (moments / (rows.mean() * variance + _PENALTY)) @ bases.T
+        return np.asarray(attributes @ slopes.T)
+
+    predicted = np.zeros(len(items))
+    for fold in range(_FOLDS):
+        rows = folds == fold
+        predicted[rows] = (solve(~rows)[items[rows]] * context[rows]).sum(1)
+    return predicted, solve(folds >= 0)
+
+
+def _best_number(trees: BoostedTrees, inputs: Array, liked: BoolArray) -> int:
+    """How many of the trees have the lowest log loss at held-out steps."""
+    losses = torch.zeros(())
+    for begin in range(0, len(inputs), _ROWS_AT_ONCE):
+        rows = slice(begin, begin + _ROWS_AT_ONCE)
+        odds = trees.stages(torch.from_numpy(inputs[rows]))
+        signed = torch.where(torch.from_numpy(liked[rows]), -odds, odds)
+        losses = losses + F.softplus(signed).sum(1)
+    return 1 + int(losses.argmin())

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pydantic
@@ -41,7 +42,8 @@ _HIGHEST = 20.0
 TREES = 100
 LEAVES = 8
 """Most trees, and leaves of a tree."""
-_SETTINGS = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
+_SETTINGS: dict[str, Any] = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
+_SETTINGS["early_stopping"] = True
 _SPLITS = LEAVES - 1
 _LOGISTIC = ("highest", "mean", "scale", "weights", "bias")
 
@@ -319,29 +321,38 @@ class BoostedTrees:
         (T, S), the `base` () of the sum, and `leaves` (T, 2^S) by numbers whose bit s is set where
         split s finds an input that is at most its threshold."""
         self._leaves, self._base = leaves, base
-        pairs = torch.stack([inputs.double(), thresholds], 2).flatten(0, 1)
-        splits, which = torch.unique(pairs, dim=0, return_inverse=True)
-        powers = (2.0 ** torch.arange(inputs.shape[1])).expand(inputs.shape)
-        bits = torch.zeros(len(inputs), len(splits))
-        self._bits = bits.scatter_add_(1, which.view(inputs.shape), powers)
-        """(T, U) float32 bits of the columns' numbers that each of the U different splits sets."""
-        self._numbers, self._thresholds = splits[:, 0].long(), splits[:, 1:]
-        """Input (U,) and threshold (U, 1) of these splits."""
+        self._powers = 2.0 ** torch.arange(inputs.shape[1])
+        # First splits of all trees, second ones, and so on.
+        self._numbers, self._thresholds = inputs.T.flatten(), thresholds.T.reshape(-1, 1)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) from inputs (M, F)."""
-        at_most = torch.le(inputs.double().T[self._numbers], self._thresholds).float()
+        return self._base + self._find_leaves(inputs).sum(0)
+
+    def stages(self, inputs: Tensor) -> Tensor:
+        """Log-odds (T, M) from inputs (M, F) by the first tree, the first two, and so on."""
+        return self._base + self._find_leaves(inputs).cumsum(0)
+
+    def _find_leaves(self, inputs: Tensor) -> Tensor:
+        """(T, M) values of the trees' leaves."""
+        columns = inputs.double().T.contiguous()
+        at_most = torch.le(columns[self._numbers], self._thresholds).float()
+        at_most = at_most.view(len(self._powers), len(self._leaves), len(inputs))
         # Numbers of leaves, which float32 has exactly.
-        columns = (self._bits @ at_most).long()
-        return self._base + self._leaves.gather(1, columns).sum(0)
+        return self._leaves.gather(1, torch.tensordot(self._powers, at_most, 1).long())
 
 
-def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
-    """Tensors of `BoostedTrees` of a bool target (M,), from inputs (M, F), of scikit-learn; a tenth
-    of the rows, drawn by `seed`, decides when to stop."""
+def fit_trees(
+    inputs: Array,
+    target: Array,
+    seed: int,
+    **settings: Any,
+) -> dict[str, Tensor]:
+    """Tensors of `BoostedTrees` of a bool target (M,), from inputs (M, F), of scikit-learn, with
+    its `settings`; by default, a tenth of the rows, drawn by `seed`, decides when to stop."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
-    model = HistGradientBoostingClassifier(early_stopping=True, random_state=seed, **_SETTINGS)
+    model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS | settings)
     model.fit(inputs, target)
     tables = [_tabulate(trees[0].nodes) for trees in model._predictors]
     splits, thresholds, leaves = (

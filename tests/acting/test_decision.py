@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from ucfrec.acting.decision import DecisionRule, best_items
+from ucfrec.acting.decision import DecisionRule, ListTerm, best_items
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 
@@ -142,13 +142,21 @@ def test_what_is_chosen_and_ranked_first_follows_the_probabilities(rule: Decisio
             torch.testing.assert_close(shares, probabilities[row], rtol=0, atol=0.015)
 
 
+def repel(items: torch.Tensor) -> torch.Tensor:
+    """Of seven items, those of the same parity as one above lose one and a half."""
+    return -1.5 * ((torch.arange(7) - items.unsqueeze(1)) % 2 == 0)
+
+
 @pytest.mark.parametrize("rule", RANDOM, ids=str)
 @pytest.mark.parametrize("n", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
-def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: int) -> None:
-    """Chi-square over all lists of three of the five items; one item may not be shown."""
-    scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5]]).expand(n, -1)
+@pytest.mark.parametrize("term", [None, repel])
+def test_lists_are_as_frequent_as_their_propensities_say(
+    rule: DecisionRule, n: int, term: ListTerm | None
+) -> None:
+    """Chi-square over all lists of three of four items; the others may not be shown."""
+    scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5, *[-math.inf] * 2]]).expand(n, -1)
     generator = torch.Generator().manual_seed(2)
-    items, propensities = rule.rank_items(scores, 3, draws(scores, generator))
+    items, propensities = rule.rank_items(scores, 3, draws(scores, generator), term)
     lists, number, counts = items.unique(dim=0, return_inverse=True, return_counts=True)
     stated = torch.zeros(len(lists), dtype=torch.float64)
     stated[number] = propensities.prod(1)
@@ -158,14 +166,17 @@ def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: 
 
 
 @pytest.mark.parametrize("rule", [*RANDOM, DecisionRule(0.0)], ids=str)
-def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(rule: DecisionRule) -> None:
+@pytest.mark.parametrize("term", [None, repel])
+def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(
+    rule: DecisionRule, term: ListTerm | None
+) -> None:
     generator = torch.Generator().manual_seed(3)
     scores = torch.randn(300, 7, generator=generator)
     scores[torch.rand(300, 7, generator=generator) < 0.2] = -math.inf
-    items, propensities = rule.rank_items(scores, 4, draws(scores, generator))
+    items, propensities = rule.rank_items(scores, 4, draws(scores, generator), term)
     for place in range(5):
         earlier = torch.nn.functional.pad(items[:, :place], (0, 1), value=-1)
-        chances = rule.log_probabilities(scores, earlier).double().exp()
+        chances = rule.log_probabilities(scores, earlier, term).double().exp()
         torch.testing.assert_close(chances.sum(1), torch.ones(300).double(), atol=1e-5, rtol=0)
         assert not chances.gather(1, items[:, :place]).any()
         if place < 4:
@@ -173,60 +184,21 @@ def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(rule: Decisio
             torch.testing.assert_close(of_items, propensities[:, place], atol=1e-6, rtol=1e-5)
 
 
-def repel(items: torch.Tensor) -> torch.Tensor:
-    """Items of the same parity as one above lose one and a half."""
-    return -1.5 * ((torch.arange(7) - items.unsqueeze(1)) % 2 == 0)
-
-
-IN_TURN = [
-    DecisionRule(0.0),
-    DecisionRule(0.0, temperature=0.7),
-    DecisionRule(0.0, temperature=0.7, top_k=3, explore=0.4),
-    DecisionRule(0.0, explore=0.3, explore_top=4),
-]
-
-
-@pytest.mark.parametrize("rule", IN_TURN, ids=str)
-def test_a_list_by_marginal_gain_is_drawn_item_by_item(rule: DecisionRule) -> None:
-    """Its probabilities are those of single draws under the scores that the items above leave."""
+@pytest.mark.parametrize("rule", [*RANDOM, DecisionRule(0.0)], ids=str)
+def test_a_list_by_marginal_gain_is_drawn_as_single_items_of_what_is_left(
+    rule: DecisionRule,
+) -> None:
     generator = torch.Generator().manual_seed(3)
     scores = torch.randn(300, 7, generator=generator)
-    scores[torch.rand(300, 7, generator=generator) < 0.2] = -math.inf
-    uniforms = draws(scores, generator)
-    items, propensities = rule.rank_items(scores, 7, uniforms, repel)
-    assert (items.sort(1).values == torch.arange(7)).all()
-    single = [replace(rule, explore=0.0), replace(rule, explore=1.0)]
+    items, propensities = rule.rank_items(scores, 7, draws(scores, generator), repel)
     modes = torch.tensor([[1 - rule.explore], [rule.explore]]).log().double().expand(2, 300)
-    left = scores.clone()
-    for place in range(7):
-        earlier = torch.nn.functional.pad(items[:, :place], (0, 1), value=-1)
-        chances = rule.log_probabilities(scores, earlier, repel).double().exp()
-        torch.testing.assert_close(chances.sum(1), torch.ones(300).double(), atol=1e-5, rtol=0)
-        assert not chances.gather(1, items[:, :place]).any()
-        column = items[:, place : place + 1]
-        of_items = chances.gather(1, column)[:, 0]
-        torch.testing.assert_close(of_items, propensities[:, place], atol=1e-6, rtol=1e-4)
-        some = left.amax(1) > -math.inf
-        logs = torch.stack([each.log_probabilities(left[some]).double() for each in single])
-        posterior = modes[:, some].log_softmax(0).unsqueeze(2)
-        expected = (posterior + logs).logsumexp(0).exp()
-        torch.testing.assert_close(chances[some], expected, atol=1e-5, rtol=0)
-        modes = modes.clone()
-        modes[:, some] += logs.gather(2, column[some].expand(2, -1, 1))[:, :, 0]
-        left = (left + repel(items[:, place])).scatter(1, column, -math.inf)
-
-
-@pytest.mark.parametrize("rule", IN_TURN[1:], ids=str)
-def test_lists_by_marginal_gain_are_as_frequent_as_their_propensities(rule: DecisionRule) -> None:
-    n = 20_000
-    scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5, -math.inf, -math.inf]]).expand(n, -1)
-    uniforms = draws(scores, torch.Generator().manual_seed(2))
-    items, propensities = rule.rank_items(scores, 3, uniforms, repel)
-    lists, number, counts = items.unique(dim=0, return_inverse=True, return_counts=True)
-    stated = torch.zeros(len(lists), dtype=torch.float64)
-    stated[number] = propensities.prod(1)
-    assert float(stated.sum()) == pytest.approx(1, abs=1e-6)
-    assert chisquare(counts.numpy(), n * (stated / stated.sum()).numpy()).pvalue > 1e-3
+    for place, column in enumerate(items.split(1, dim=1)):
+        single = [replace(rule, explore=share).log_probabilities(scores) for share in (0.0, 1.0)]
+        logs = torch.stack(single).double().gather(2, column.expand(2, -1, 1))[:, :, 0]
+        expected = (modes.log_softmax(0) + logs).logsumexp(0).exp()
+        torch.testing.assert_close(propensities[:, place], expected, atol=1e-6, rtol=1e-4)
+        modes = modes + logs
+        scores = (scores + repel(column[:, 0])).scatter(1, column, -math.inf)
 
 
 def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:

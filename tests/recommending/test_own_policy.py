@@ -52,6 +52,8 @@ def test_weights_are_one(
     with read_logged_sessions(trained, logs, LogMapping(), keep_unknown=True) as logged:
         scored = pd.concat(score(trained, logged, rule))
         np.testing.assert_allclose(scored.probability, scored.propensity, rtol=1e-4)
+        best = pd.concat(score(trained, logged, replace(rule, temperature=0.0, explore=0.0)))
+        assert ((best.probability == 1) == (best.item_id == best.greedy_item_id)).all()
         report = evaluate_off_policy(trained, logged, rule=rule, seed=0)
     weights = {row.method: row.metrics["effective_sessions"] for row in report.rows}
     assert weights["PDIS"] == pytest.approx(weights["logged"], rel=1e-3)

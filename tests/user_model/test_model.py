@@ -88,6 +88,25 @@ def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: Epis
     assert all(users.step(one)[0].all() for _ in range(6))
 
 
+def test_what_users_think_of_an_item_depends_on_its_place_and_what_is_above(
+    store: EpisodeStore,
+) -> None:
+    users = users_of(store, 0.0, (0.5, 1.0))
+    users.reward.position[:2] = torch.tensor([-0.5, -1.5])
+    users.reward.above.fill_(-2.0)
+    simulator, tags = UserSimulator(users, store, 5, 50, 3, length=3), store.item_states.tags
+    for _ in range(2):  # two lists
+        odds = []
+        for item in (3, 7, 3):
+            simulator.step(np.full(5, item))
+            odds.append(float(torch.logit(torch.tensor(simulator.expected[0]))))
+        shared = [len({*tags[n].tolist()} & {*tags[3].tolist()} - {-1}) for n in (7, 3)]
+        assert shared[0] > 0
+        above = [0, shared[0], shared[0] + shared[1]]
+        expected = [1 + 0.5 * (p - 2 * n) for p, n in zip((0, -0.5, -1.5), above, strict=True)]
+        assert odds == pytest.approx(expected, abs=1e-4)
+
+
 def test_sessions_that_go_on_are_what_they_would_be_with_the_others(store: EpisodeStore) -> None:
     """Each session draws numbers of its own, however many have ended; at 20 steps all have."""
     paid = []

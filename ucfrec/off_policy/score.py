@@ -214,7 +214,11 @@ def score_steps(
                 scores, shared = scores[decision], torch.from_numpy(decision)
             else:
                 shared = torch.arange(len(first))
-            log_probabilities = scorer.rule.log_probabilities(scores, of_list, scorer.list_term)
+            term = scorer.list_term
+            log_probabilities = scorer.rule.log_probabilities(scores, of_list, term)
+            if term is not None:
+                for above in of_list.unbind(1):
+                    scores += term(above.clamp(min=0)).masked_fill(above.unsqueeze(1) < 0, 0.0)
             row, place = torch.nonzero(of_list >= 0, as_tuple=True)
             scores[row, of_list[row, place]] = -torch.inf
             yield ScoredSteps(

@@ -53,10 +53,14 @@ class News:
         """Articles that may be shown at an hour after `START`."""
         return np.flatnonzero((self.published <= hour) & (hour < self.expires))
 
-    def chances(self, visitor: int, articles: np.ndarray, hour: float) -> np.ndarray:
-        """Probabilities of a click on each article of a page, from the top."""
+    def chances(
+        self, visitor: int | np.ndarray, articles: np.ndarray, hour: float | np.ndarray
+    ) -> np.ndarray:
+        """Probabilities of a click on each article of a page, from the top; or of many pages, each
+        a row, with visitors and hours in columns."""
         odds = 3.2 * self.taste[visitor, self.section[articles]] + 0.7 * self.quality[articles]
-        odds -= 2.7 + 0.02 * (hour - self.published[articles]) + 0.12 * np.arange(len(articles))
+        place = np.arange(articles.shape[-1])
+        odds -= 2.7 + 0.02 * (hour - self.published[articles]) + 0.12 * place
         return np.asarray(1 / (1 + np.exp(-odds)))
 
     def draw_log(self, sessions: int, seed: int) -> pd.DataFrame:

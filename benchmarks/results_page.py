@@ -17,6 +17,8 @@ from textwrap import TextWrapper
 from typing import Final
 
 import numpy as np
+import pandas as pd
+from off_policy_coverage import share_interval
 
 from ucfrec.benchmark.tables import (
     BySeed,
@@ -37,7 +39,7 @@ RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
 PICTURES = ROOT / "docs" / "assets" / "tables"
 FILES = (
     *("recommendation", "counterfactual_copies"),
-    *("control", "control_medium", "control_robustness", "control_spread"),
+    *("control", "control_medium", "control_robustness", "control_spread", "launches"),
 )
 PAPER = """\
 | method | KuaiRand R_cum | R_avg | KuaiRec R_cum | R_avg | VirtualTB R_cum | R_avg |
@@ -78,6 +80,14 @@ UCF = (
 )
 METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQUENCE), *UCF)
 """Order of the lines."""
+ANSWERS = ("launch", "test it", "do not launch", "the log cannot say")
+LOGS = {
+    "gain": "true gain {:+.0%}",
+    "task": "{}",
+    "users": "{:,} users",
+    "exploration": "{:.0%} exploration",
+}
+"""What launches are counted by, and in which words."""
 NEAR = 0.05
 """Share of the best score by which control's scores may be lower and still be bold."""
 _Files = Mapping[str, Sequence[ResultRow]]
@@ -361,6 +371,48 @@ def contexts(rows: Sequence[ResultRow]) -> str:
         lines.append((method, context, *cells, mean))
     head = ("method", "context", *(task.removesuffix("-zoo") for task in tasks), "mean")
     return markdown_table(head, lines)
+
+
+def answers(rows: Sequence[ResultRow]) -> str:
+    """How often an answer of `ope` was right, and what it answered in which launches."""
+    log = pd.DataFrame([row.as_line() | row.details | row.details.get("finds", {}) for row in rows])
+    launched, refused = log.answer == "launch", log.answer == "do not launch"
+    better, high, tested = log.gain > 0, log.gain >= 0.1, log["session"].notna()
+    by_session, by_item = (log[unit].eq(True) for unit in ("session", "item"))
+    held = (log.low <= log.true * log.logged) & (log.true * log.logged <= log.high)
+    shares = (
+        ("`launch`: policies that are not better", launched, ~better),
+        ("policies that are not better: `launch`", ~better, launched),
+        ("policies better by the wanted 5% or more: `do not launch`", better, refused),
+        ("+10% and +20%: `launch`, or found by the planned test", high, launched | by_session),
+        ("planned tests of +5%, as wanted: gain found", tested & better & ~high, by_session),
+        ("planned tests of +10% and +20%: gain found", tested & high, by_session),
+        ("the same, by reward per item", tested & high, by_item),
+        ("planned tests of what is not better: gain found", tested & ~better, by_session),
+        ("the same, by reward per item", tested & ~better, by_item),
+        ("intervals of the lift without reasons against them: hold it", log.reliable, held),
+    )
+    lines = list[tuple[object, ...]]()
+    for name, among, right in shares:
+        share, count = float(right[among].mean()), int(among.sum())
+        low, top = share_interval(share, count)
+        lines.append((name, count, f"{share:.1%}", f"{max(low, 0.0):.1%} to {top:.1%}"))
+    said = [
+        (
+            name.format(value),
+            len(group),
+            *(f"{(group.answer == one).mean():.0%}" for one in ANSWERS),
+        )
+        for column, name in LOGS.items()
+        for value, group in log.groupby(column)
+    ]
+    return "\n\n".join(
+        (
+            markdown_table(("of these, the share", "number", "share", "95% interval"), lines),
+            "<!-- chart: launches; Share of answers in percent; launch, test it, do not launch -->",
+            markdown_table(("launches", "number", *ANSWERS), said),
+        )
+    )
 
 
 def of(name: str, table: str) -> Callable[[_Files], Sequence[ResultRow]]:

@@ -1,6 +1,6 @@
 """How often the answer of `ucfrec ope` is right, in launches whose true gain is known.
 
-    python benchmarks/launches.py --launches 360      # 40 minutes of one core; resumes
+    python benchmarks/launches.py --launches 360      # 20 minutes of one core; resumes
 
 Each launch has a log of its own, of a policy that draws items by scores, and uniformly in a share
 of its requests. The policy to launch draws by these scores with noise, and with so much of the
@@ -41,7 +41,7 @@ from scipy.special import logit
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.errors import InputNote
-from ucfrec.logs.mapping import LogMapping, read_mapping
+from ucfrec.logs.mapping import read_mapping
 from ucfrec.off_policy.ab_test import compare_arms
 from ucfrec.processes import progress
 from ucfrec.python_api.recommender import Recommender
@@ -74,10 +74,6 @@ class Catalogue:
         self._of = SyntheticCatalog(1, n_items=60, environment_seed=seed)
         self.quality = logit(self._of.click_probabilities.mean(axis=0))
         self.population = len(self._of.logits)
-
-    def read(self, folder: Path) -> LogMapping:
-        """How to read its logs."""
-        return LogMapping()
 
     def nearby(self, hour: Float64Array) -> IntArray:
         """(S, W) items among which are all that sessions of an hour (S,) may show."""
@@ -116,13 +112,9 @@ class Publisher:
     page, longest, repeats = PAGE, LONGEST, False
 
     def __init__(self, seed: int) -> None:
-        self._of, self._seed = News(seed), seed
+        self._of = News(seed)
         self.quality, self.population = self._of.quality, len(self._of.taste)
         self.chances = self._of.chances
-
-    def read(self, folder: Path) -> LogMapping:
-        make_news_log(folder, sessions=1, seed=self._seed)
-        return replace(read_mapping(folder / "news.toml"), columns={}, reward=None)
 
     def nearby(self, hour: Float64Array) -> IntArray:
         first = np.searchsorted(self._of.published, hour - 72)
@@ -229,7 +221,10 @@ def train(name: str, seed: int, scratch: Path) -> Path:
     folder, arm = scratch / f"{name}-{seed}", make_arm(name, seed)
     log = replace(arm, rule=replace(DRAW, explore=1.0)).play(2000, [seed, 8])
     rows = log.drop(columns="chance").assign(user_id=log.user_id + 10**6)
-    mapping = arm.world.read(folder)
+    mapping = None
+    if isinstance(arm.world, Publisher):
+        make_news_log(folder, sessions=1, seed=seed)
+        mapping = replace(read_mapping(folder / "news.toml"), columns={}, reward=None)
     return Recommender("item-rate").fit(rows, folder / "run", mapping=mapping).run
 
 

@@ -37,8 +37,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from measured_rows import make_parser
+from scipy.special import softmax
 
-from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.arrays import Float64Array
 from ucfrec.off_policy.answer import conclude
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -46,6 +47,7 @@ from ucfrec.off_policy.models import fit_models
 from ucfrec.processes import progress
 from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, append_rows
+from ucfrec_simulators.session_env import draw_categories
 
 SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
 LOW, HIGH = 0.90, 0.98
@@ -77,8 +79,8 @@ class Environment:
         rng = np.random.default_rng([seed, 1])
         shape = (self.contexts, self.actions)
         logits = rng.normal(size=shape)
-        behavior = softmax(logits)
-        target = softmax(logits + self.distance * rng.normal(size=shape))
+        behavior = softmax(logits, axis=1)
+        target = softmax(logits + self.distance * rng.normal(size=shape), axis=1)
         pays = self.reward * rng.uniform(0.4, 1.6, shape)
         return behavior, target, pays, rng.dirichlet(np.ones(self.contexts), shape)
 
@@ -104,11 +106,11 @@ class Environment:
         at = np.empty((2, sessions, self.steps), dtype=np.int64)
         reward = np.empty((sessions, self.steps))
         for step in range(self.steps):
-            action = drawn(behavior[context], rng)
+            action = draw_categories(behavior[context], rng.random(sessions))
             at[:, :, step] = context, action
             paid = rng.random(sessions) < np.clip(pays[context, action] + extra, 0, 1)
             reward[:, step] = paid
-            context = drawn(follows[context, action], rng)
+            context = draw_categories(follows[context, action], rng.random(sessions))
         contexts, actions = at.reshape(2, -1)
         steps = LoggedSteps(
             session=np.repeat(np.arange(sessions), self.steps),
@@ -142,17 +144,6 @@ ENVIRONMENTS = {
     "heavy tails, eight steps": Environment(users=1500, steps=8, distance=0.8),
     "wrong model": Environment(users=3000, contexts=12, reward=0.1, model_knows=False),
 }
-
-
-def softmax(logits: Float64Array) -> Float64Array:
-    exponents = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return np.asarray(exponents / exponents.sum(axis=1, keepdims=True))
-
-
-def drawn(probabilities: Float64Array, rng: np.random.Generator) -> IntArray:
-    """(n,) a column drawn from each row (n, K)."""
-    beyond = rng.random((len(probabilities), 1)) > probabilities.cumsum(axis=1)
-    return np.asarray(np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1))
 
 
 class Replication(NamedTuple):

@@ -51,12 +51,24 @@ class News:
 
     def alive(self, hour: float) -> np.ndarray:
         """Articles that may be shown at an hour after `START`."""
-        return np.flatnonzero((self.published <= hour) & (hour < self.expires))
+        return np.flatnonzero(self.is_alive(slice(None), hour))
 
-    def chances(self, visitor: int, articles: np.ndarray, hour: float) -> np.ndarray:
-        """Probabilities of a click on each article of a page, from the top."""
+    def is_alive(self, articles: np.ndarray | slice, hour: float | np.ndarray) -> np.ndarray:
+        """Whether articles may be shown at hours of the same shape."""
+        return np.asarray((self.published[articles] <= hour) & (hour < self.expires[articles]))
+
+    def goes_on(self, clicks: int | np.ndarray, draws: float | np.ndarray) -> np.ndarray:
+        """Whether another page follows one with so many clicks, by draws from [0, 1)."""
+        return np.asarray(draws <= 0.45 + 0.25 * np.minimum(clicks, 2))
+
+    def chances(
+        self, visitor: int | np.ndarray, articles: np.ndarray, hour: float | np.ndarray
+    ) -> np.ndarray:
+        """Probabilities of a click on each article of a page, from the top; or of many pages, each
+        a row, with visitors and hours in columns."""
         odds = 3.2 * self.taste[visitor, self.section[articles]] + 0.7 * self.quality[articles]
-        odds -= 2.7 + 0.02 * (hour - self.published[articles]) + 0.12 * np.arange(len(articles))
+        place = np.arange(articles.shape[-1])
+        odds -= 2.7 + 0.02 * (hour - self.published[articles]) + 0.12 * place
         return np.asarray(1 / (1 + np.exp(-odds)))
 
     def draw_log(self, sessions: int, seed: int) -> pd.DataFrame:
@@ -78,7 +90,7 @@ class News:
                     name = f"{visitor}-{time:%d%H%M%S}-{page}"
                     rows.append((name, visitor, article, time, place + 1, click, chance))
                 seen.update(articles.tolist())
-                if rng.random() > 0.45 + 0.25 * min(clicks.sum(), 2):
+                if not self.goes_on(clicks.sum(), rng.random()):
                     break
                 hour += rng.uniform(0.01, 0.07)
         names = ["page", "visitor", "article", "shown_at", "position", "clicked", "propensity"]

@@ -239,7 +239,7 @@ def test(arms: Sequence[Arm], users: int, seed: Sequence[int], file: Path) -> di
     sessions = items.groupby(["user_id", "session_id", "arm"], as_index=False)["reward"].sum()
     for unit, frame in (("session", sessions), ("item", items)):
         frame[["user_id", "arm", "reward"]].to_parquet(file)
-        planned = compare_arms([file], "reward", ("arm 0", "arm 1")).planned
+        planned = compare_arms([file], "reward", ("arm 0", "arm 1"), per="item").planned
         finds[unit] = planned.low is not None and planned.low > 0
     return finds
 

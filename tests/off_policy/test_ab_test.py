@@ -22,7 +22,9 @@ def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFr
     rate = rng.beta(1, 4, users)[user] * np.where(user % 5 == 0, 1 + lift, 1)
     clicks = (rng.random(len(user)) < rate).astype(int)
     arm = np.where(user % 5 == 0, "b", "a")
-    return pd.DataFrame({"user_id": user.astype(str), "arm": arm, "feedback": clicks})
+    hours = 3_600_000 * np.arange(len(user))  # a session each
+    columns = {"user_id": user.astype(str), "arm": arm, "feedback": clicks, "timestamp": hours}
+    return pd.DataFrame(columns)
 
 
 SHARES = {"a": 0.8, "b": 0.2}
@@ -54,7 +56,7 @@ def test_users_that_do_not_differ_or_are_few_decide_nothing(
     tmp_path: Path, a: list[int], b: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     arms, users = ["a"] * len(a) + ["b"] * len(b), range(len(a) + len(b))
-    frame = pd.DataFrame({"user_id": users, "arm": arms, "feedback": a + b})
+    frame = pd.DataFrame({"user_id": users, "arm": arms, "feedback": a + b, "timestamp": 0})
     frame.to_parquet(tmp_path / "log.parquet")
     arguments = ["compare", str(tmp_path / "log.parquet"), "--arms", "a,b"]
     assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
@@ -105,7 +107,7 @@ def test_rows_without_a_value(
     assert said in capsys.readouterr().err
     found = json.loads((tmp_path / "o.json").read_text())
     assert found["without_value"] == [of_a, of_b]
-    for name in ("values", "users", "rows"):
+    for name in ("values", "users", "units"):
         assert found[name] == pytest.approx(getattr(expected, name)), name
     assert found["always"]["low"] == pytest.approx(expected.always.low)
 
@@ -124,8 +126,8 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     # Rows of one user count as one, and users of several arms not at all.
     both = frame[frame.user_id == "1"].assign(arm="b")
     pd.concat([frame] * 4).to_parquet(tmp_path / "log.parquet")
-    again = compare_arms([tmp_path / "log.parquet"], shares=SHARES).planned
-    once = compare_arms([tmp_path / "kept.parquet"], shares=SHARES).planned
+    again = compare_arms([tmp_path / "log.parquet"], shares=SHARES, per="item").planned
+    once = compare_arms([tmp_path / "kept.parquet"], shares=SHARES, per="item").planned
     assert again.low == pytest.approx(once.low)
     pd.concat([frame, both]).to_parquet(tmp_path / "log.parquet")
     found = compare_arms([tmp_path / "log.parquet"])
@@ -135,9 +137,38 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     assert named.planned.value == pytest.approx(-found.planned.value)
 
 
+def test_returns_of_sessions_are_those_of_plain_pandas(tmp_path: Path) -> None:
+    """Arm b has half the reward of an item and twice the items: the return is the same."""
+    rng, frame = np.random.default_rng(0), log(400, 0.0, per_user=20)
+    frame["timestamp"] = rng.integers(0, 10 * 3_600_000, len(frame))
+    of_b = frame.arm == "b"
+    twice = frame[of_b].assign(timestamp=lambda rows: rows.timestamp + 1)
+    frame.loc[of_b, "feedback"] = 0
+    frame = pd.concat([frame, twice]).sample(frac=1, random_state=0)
+    frame.to_parquet(tmp_path / "log.parquet")
+    result = compare_arms([tmp_path / "log.parquet"], arms=("a", "b"), shares=SHARES)
+    ordered = frame.sort_values(["user_id", "timestamp"])
+    pauses = ordered.groupby("user_id").timestamp.diff()
+    ordered["begins"] = pauses.isna() | (pauses > 30 * 60_000)
+    sums = ordered.groupby("arm")[["feedback", "begins"]].sum()
+    assert result.units == tuple(sums.begins)
+    assert result.values == pytest.approx(tuple(sums.feedback / sums.begins))
+    assert result.planned.low is not None
+    assert result.planned.low < 0 < (result.planned.high or 0)
+    by_item = compare_arms([tmp_path / "log.parquet"], arms=("a", "b"), shares=SHARES, per="item")
+    assert by_item.conclusion == "b is worse than a"
+    days = compare_arms([tmp_path / "log.parquet"], gap_minutes=600)
+    assert sum(days.units) == 400
+    frame.drop(columns="timestamp").to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"no column 'timestamp' \(sessions, or give per item"):
+        compare_arms([tmp_path / "log.parquet"])
+
+
 def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
     users = ["1e1", "10", "2e1", "20", "30", "40"]
-    frame = pd.DataFrame({"user_id": users, "arm": ["1", "1.0"] * 3, "feedback": range(6)})
+    frame = pd.DataFrame(
+        {"user_id": users, "arm": ["1", "1.0"] * 3, "feedback": range(6), "timestamp": 0}
+    )
     frame.to_csv(tmp_path / "log.csv", index=False)
     found = compare_arms([tmp_path / "log.csv"])
     assert (found.arms, found.users, found.in_several) == (("1", "1.0"), (3, 3), 0)

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, Table
 from ucfrec.commands.shared_options import LogOptions, RunArgument
@@ -226,8 +226,12 @@ class Compare(Table):
     arms: Annotated[str | None, "A,B"] = None
     """Compare B with A (default: the two arms that there are)"""
     expected: Annotated[float | None, "DIFFERENCE"] = None
-    """Difference per shown item for which the always-valid interval is shortest; fix it before the
-    test (default: 5% of the value of A)"""
+    """Difference for which the always-valid interval is shortest; fix it before the test (default:
+    5% of the value of A)"""
+    per: Literal["session", "item"] = "session"
+    """Compare sums per session, as tests that ope plans, or means per shown item."""
+    gap_minutes: float = 30.0
+    """A longer pause of a user ends a session, in minutes."""
     shares: Annotated[str | None, "A=SHARE,B=SHARE"] = None
     """Shares of the users that were intended for the arms, as of serve --split (default: equal)"""
     guardrail: Annotated[Sequence[str], "MEASURE"] = ()
@@ -259,6 +263,8 @@ class Compare(Table):
             self.memory_limit,
             self.guardrail,
             self.by,
+            self.per,
+            self.gap_minutes,
         )
         print(result)
         if self.json:

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import NormalDist
 from tempfile import gettempdir
+from typing import Literal
 
 import pandas as pd
 
@@ -29,15 +31,17 @@ MISMATCH = 0.001
 """Below this p-value, the users were not drawn into the arms by the intended shares."""
 _LARGEST = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""
+Per = Literal["session", "item"]
 _NAMED = 3
 """Most users of several arms that are named."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two arms of an A/B test, by the mean of a column per shown item."""
+    """Two arms of an A/B test, by the mean of a column per session or per shown item."""
 
     column: str
+    per: Per
     arms: tuple[str, str]
     values: tuple[float, float]
     users: tuple[int, int]
@@ -46,8 +50,8 @@ class Comparison:
     """All users of the arms."""
     shares: tuple[float, float]
     """Intended shares of the arms among the users of both."""
-    rows: tuple[int, int]
-    """Rows with a value, which count; what follows is left out."""
+    units: tuple[int, int]
+    """Sessions or shown items with a value, which count; what follows is left out."""
     without_value: tuple[int, int]
     """Rows of these arms without a value."""
     without_user: int
@@ -69,9 +73,10 @@ class Comparison:
     def __str__(self) -> str:
         lines = [self.conclusion]
         lines += [
-            f"{name}: {value:.4g} {self.column} per shown item; {users:,} users, {rows:,} items"
-            for name, value, users, rows in zip(
-                self.arms, self.values, self.users, self.rows, strict=True
+            f"{name}: {value:.4g} {self.column} per {self.per}; {users:,} users, "
+            f"{units:,} {self.per}s"
+            for name, value, users, units in zip(
+                self.arms, self.values, self.users, self.units, strict=True
             )
         ]
         names = ", ".join(self.several_names) + ", …" * (self.in_several > len(self.several_names))
@@ -122,23 +127,23 @@ def always_valid(
 
 @dataclass(frozen=True)
 class _Means:
-    """The means of a measure per shown item in two arms, with their errors over users."""
+    """The means of a measure per unit in two arms, with their errors over users."""
 
     values: tuple[float, float]
     errors: tuple[float, float]
     users: tuple[int, int]
-    rows: tuple[int, int]
+    units: tuple[int, int]
 
     @classmethod
     def of(cls, arms: Sequence[pd.DataFrame]) -> "_Means":
         """Of the users with a value in two arms."""
         (value_a, error_a), (value_b, error_b) = (
-            cluster_mean((arm["value"] / arm["shown"]).to_numpy(), None, arm["shown"].to_numpy())
+            cluster_mean((arm["value"] / arm["units"]).to_numpy(), None, arm["units"].to_numpy())
             for arm in arms
         )
-        rows_a, rows_b = (int(arm["shown"].sum()) for arm in arms)
+        units_a, units_b = (int(arm["units"].sum()) for arm in arms)
         users = len(arms[0]), len(arms[1])
-        return cls((value_a, value_b), (error_a, error_b), users, (rows_a, rows_b))
+        return cls((value_a, value_b), (error_a, error_b), users, (units_a, units_b))
 
     def list_faults(self) -> tuple[str, ...]:
         """Why there is no interval."""
@@ -180,10 +185,13 @@ def compare_arms(
     memory_limit: str = "2GB",
     guardrails: Sequence[str] = (),
     by: str | None = None,
+    per: Per = "session",
+    gap_minutes: float = 30.0,
 ) -> Comparison:
-    """Compare two arms, or the two that there are, most users first, in logs of `ucfrec join`.
-    Users are drawn into arms, so they are clusters. Rows without a value are left out, with an
-    `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
+    """Compare two arms, or the two that there are, most users first, in logs of `ucfrec join`, by
+    the sum of a column `per` session, which a longer pause than `gap_minutes` ends, or per shown
+    item. Users are drawn into arms, so they are clusters. Rows without a value are left out, with
+    an `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
     beforehand; None for 5% of the first arm's value. `shares` of the users were intended for the
     arms, by name; None for equal ones. `guardrails` are as `dwell_seconds >= -2%`; `by` is a column
     or expression to show the difference by.
@@ -194,9 +202,11 @@ def compare_arms(
     """
     fault = f"expected is {expected}; give a difference above 0, and below {_LARGEST:g}"
     require(expected is None or 1 / _LARGEST < expected < _LARGEST, fault)
+    require(gap_minutes > 0, f"gap_minutes is {gap_minutes}; give minutes above 0")
     files = log_files(paths)
     name = first_and_more(files)
-    groups = _sum_by_user(files, column, memory_limit)
+    read = partial(_sum_by_user, files, memory_limit, gap_minutes if per == "session" else None)
+    groups = read(column)
     by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
     if len({*names}) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
@@ -217,24 +227,24 @@ def compare_arms(
     planned, always = means.compare(expected, reasons)
     results = []
     for guardrail in map(Guardrail.parse, guardrails):
-        all_rows, values = _split_arms(_sum_by_user(files, guardrail.measure, memory_limit))
+        all_rows, values = _split_arms(read(guardrail.measure))
         if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
         _count_missing(name, guardrail.measure, names, all_rows)
         results.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
     differences: list[GroupDifference] = []
     if by is not None:
-        parts = _sum_by_user(files, column, memory_limit, by)
-        differences = _compare_parts(parts, names, expected, reasons)
+        differences = _compare_parts(read(column, by), names, expected, reasons)
     mixed = groups["name"].dropna().unique()
     return Comparison(
         column=column,
+        per=per,
         arms=(first, second),
         values=means.values,
         users=means.users,
         in_arm=in_arm,
         shares=(share, 1 - share),
-        rows=means.rows,
+        units=means.units,
         without_value=without_value,
         without_user=int(groups["rows"][~groups["who"]].sum()),
         without_arm=int(groups["rows"][groups["who"] & (groups[schema.ARM] == "")].sum()),
@@ -298,10 +308,14 @@ def _split_arms(groups: pd.DataFrame) -> tuple[dict[str, pd.DataFrame], dict[str
 
 
 def _sum_by_user(
-    files: Sequence[Path], measure: str, memory_limit: str, by: str | None = None
+    files: Sequence[Path],
+    memory_limit: str,
+    gap_minutes: float | None,
+    measure: str,
+    by: str | None = None,
 ) -> pd.DataFrame:
-    """Sum of the values, numbers of values and rows of each user in each arm and part, "" for none;
-    and the names of users of several arms.
+    """Sum of the values, numbers of values, rows and units of each user in each arm and part, ""
+    for none; and the names of users of several arms. Units are sessions, or values without a gap.
 
     Raises:
         InputError: a column is missing, `measure` is no number, or a value is infinite.
@@ -321,23 +335,37 @@ def _sum_by_user(
                 for what, name in (("users", schema.USER_ID), ("arms of join", schema.ARM))
             ]
             part = bind(connection, table, "--by", by) if by is not None else None
-            columns = [*value.columns, *(part.columns if part else ())]
+            columns, time = [*value.columns, *(part.columns if part else ())], "NULL"
+            if gap_minutes is not None:
+                times = bind(connection, table, "sessions, or give per item", schema.TIMESTAMP)
+                if not is_number(times.kind):
+                    remedy = "convert it to milliseconds, as join writes it, or compare per item"
+                    raise wrong_type(table, "times", schema.TIMESTAMP, times.kind, remedy)
+                columns, time = [*columns, *times.columns], times.sql
             selects.append(
                 f"SELECT nullif({ids[0]}, '') AS who, nullif({ids[1]}, '') AS arm, "
-                f"CAST({value.sql} AS DOUBLE) AS value, "
+                f"CAST({value.sql} AS DOUBLE) AS value, CAST({time} AS DOUBLE) AS time, "
                 f"{f'CAST({part.sql} AS VARCHAR)' if part else 'NULL'} AS part "
                 f"FROM {table.add_texts(columns, (schema.USER_ID, schema.ARM)).sql}"
             )
+        begins = (
+            "true"
+            if gap_minutes is None
+            else (f"coalesce(time - lag(time) OVER sessions > {60_000 * gap_minutes}, true)")
+        )
         mixed = "coalesce(min(arm) OVER users <> max(arm) OVER users, false)"
         with explain_errors(connection, tables):
             rows: pd.DataFrame = connection.execute(
                 "SELECT who IS NOT NULL AS who, coalesce(arm, '') AS arm, "
-                "coalesce(part, '') AS part, value, shown, rows, beyond, "
+                "coalesce(part, '') AS part, value, shown, units, rows, beyond, "
                 f"{mixed} AS mixed, CASE WHEN {mixed} THEN who END AS name FROM ("
                 "SELECT who, arm, part, coalesce(sum(value), 0) AS value, "
-                "count(value) AS shown, count(*) AS rows, "
+                "count(value) AS shown, count(value) FILTER (begins) AS units, count(*) AS rows, "
                 f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond "
-                f"FROM ({' UNION ALL BY NAME '.join(selects)}) GROUP BY who, arm, part) AS groups "
+                f"FROM (SELECT *, {begins} AS begins FROM "
+                f"({' UNION ALL BY NAME '.join(selects)}) WINDOW sessions AS "
+                "(PARTITION BY who, arm, part, value IS NULL ORDER BY time)) "
+                "GROUP BY who, arm, part) AS groups "
                 "WINDOW users AS (PARTITION BY groups.who) "
                 "ORDER BY groups.arm, groups.who, groups.part"
             ).df()

@@ -92,8 +92,8 @@ class ABTest:
         return (
             f"plan: {self.users:,} users{time}, half of them served by each policy, find a gain of "
             f"{self.lift:.3g} per session in 4 of 5 tests\n"
-            "stop: at that end by the interval of a planned end of ucfrec compare, given a row per "
-            "session with its return, or earlier as soon as its always-valid interval excludes 0"
+            "stop: at that end by the interval of a planned end of ucfrec compare, or earlier as "
+            "soon as its always-valid interval excludes 0"
         )
 
 

@@ -150,7 +150,7 @@ def _conclude_comparison(test: Comparison) -> Finding:
     """What an A/B test says."""
     intervals = _list_intervals({"as planned": test.planned, "whenever looked at": test.always})
     first, second = test.arms
-    title = f"{test.column} per shown item: {second} less {first}, with 95% intervals"
+    title = f"{test.column} per {test.per}: {second} less {first}, with 95% intervals"
     chart = interval_chart(title, intervals, ("no difference", 0.0))
     remarks = str(test).splitlines()[1:]
     return Finding(f"The A/B test of {first} and {second}", test.conclusion, (), remarks, chart)

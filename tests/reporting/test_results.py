@@ -121,9 +121,9 @@ def test_rows_of_any_metric_have_a_picture_and_a_table_from_the_best(tmp_path: P
 
 def test_an_ab_test_an_update_and_other_objects_are_shown(tmp_path: Path) -> None:
     counts: dict[str, Any] = {"without_user": 0, "without_arm": 0, "in_several": 3}
-    pairs = dict.fromkeys(("users", "in_arm", "rows", "without_value"), (500, 500))
+    pairs = dict.fromkeys(("users", "in_arm", "units", "without_value"), (500, 500))
     test = Comparison(
-        column="clicks", arms=("old", "new"), values=(1.0, 1.5), shares=(0.5, 0.5),
+        column="clicks", per="item", arms=("old", "new"), values=(1.0, 1.5), shares=(0.5, 0.5),
         planned=Evidence(0.5, 0.3, 0.7), always=Evidence(0.5, 0.125, 0.875),
         several_names=("a", "b"),
         **pairs, **counts,

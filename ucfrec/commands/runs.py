@@ -220,7 +220,7 @@ class Compare(Table):
     """`ucfrec compare`."""
 
     logs: Annotated[Sequence[str], ARGUMENT, INPUT]
-    """Logs of `ucfrec join`, whose exposures `serve --split` wrote."""
+    """Logs of `ucfrec join`, of `serve --split`."""
     column: str = "feedback"
     """Feedback that counts, a number of each shown item."""
     arms: Annotated[str | None, "A,B"] = None
@@ -229,20 +229,20 @@ class Compare(Table):
     """Difference for which the always-valid interval is shortest; fix it before the test (default:
     5% of the value of A)"""
     per: Literal["session", "item"] = "session"
-    """Compare sums per session, as tests that ope plans, or means per shown item."""
+    """Compare sums per session or means per item."""
     gap_minutes: float = 30.0
-    """A longer pause of a user ends a session, in minutes."""
+    """Pause that ends a session."""
     shares: Annotated[str | None, "A=SHARE,B=SHARE"] = None
     """Shares of the users that were intended for the arms, as of serve --split (default: equal)"""
     guardrail: Annotated[Sequence[str], "MEASURE"] = ()
     """Least (or largest) change of B in a measure, in percent, e.g. 'dwell_seconds >= -2%';
     repeatable"""
     by: Annotated[str | None, "COLUMN"] = None
-    """Also compare within groups of the rows, by a column or expression."""
+    """Also compare by a column or expression."""
     json: Path | None = None
     """Also write the numbers as JSON."""
     memory_limit: str = "2GB"
-    """Memory of the process while it reads the logs, from 800MB on."""
+    """Memory while the logs are read, from 800MB on."""
 
     def execute(self) -> None:
         """Print both arms and their difference."""

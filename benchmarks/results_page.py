@@ -540,7 +540,7 @@ SECTIONS = (
         "The search for the context of each method at the medium budget: one seed, in other "
         "episodes than those of the reported scores, trained on a GPU (H200). DT and DC do better "
         "with 8 steps, UCF with 20. LSDT with 20 was measured on one file only, so it keeps 8.",
-        "`python benchmarks/control_search.py contexts --budget medium`",
+        "a script of earlier commits, `control_search.py contexts --budget medium`",
         of("control_medium", "contexts"),
         contexts,
     ),

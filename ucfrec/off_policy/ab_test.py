@@ -205,8 +205,8 @@ def compare_arms(
     require(gap_minutes > 0, f"gap_minutes is {gap_minutes}; give minutes above 0")
     files = log_files(paths)
     name = first_and_more(files)
-    read = partial(_sum_by_user, files, memory_limit, gap_minutes if per == "session" else None)
-    groups = read(column)
+    sum_up = partial(_sum_by_user, files, memory_limit, gap_minutes if per == "session" else None)
+    groups = sum_up(column)
     by_arm, valued = _split_arms(groups)
     names = arms or sorted(valued, key=lambda arm: -len(valued[arm]))
     if len({*names}) != 2 or min(len(valued.get(arm, ())) for arm in names) < 2:
@@ -227,14 +227,14 @@ def compare_arms(
     planned, always = means.compare(expected, reasons)
     results = []
     for guardrail in map(Guardrail.parse, guardrails):
-        all_rows, values = _split_arms(read(guardrail.measure))
+        all_rows, values = _split_arms(sum_up(guardrail.measure))
         if not all(len(values.get(arm, ())) for arm in names):
             raise InputError(f"{name}: an arm has no value of {guardrail.measure}")
         _count_missing(name, guardrail.measure, names, all_rows)
         results.append(_Means.of([values[arm] for arm in names]).check(guardrail, reasons))
     differences: list[GroupDifference] = []
     if by is not None:
-        differences = _compare_parts(read(column, by), names, expected, reasons)
+        differences = _compare_parts(sum_up(column, by), names, expected, reasons)
     mixed = groups["name"].dropna().unique()
     return Comparison(
         column=column,

@@ -113,8 +113,8 @@ SEARCHED: Final = {
 
 @cache
 def chosen_rates(budget: str) -> Mapping[str, float]:
-    """The learning rate of each method of `SEARCHED`, chosen on validation loss by
-    `benchmarks/control_search.py`; empty for a budget without a search."""
+    """The learning rate of each method of `SEARCHED`, chosen on validation loss;
+    empty for a budget without a search."""
     text = files("ucfrec_control.benchmark").joinpath("rates.toml").read_text(encoding="utf-8")
     rates: Mapping[str, float] = tomllib.loads(text).get(budget, {})
     return rates

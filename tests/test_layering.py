@@ -38,6 +38,7 @@ ORDER = (
 )
 """Rooms and single modules of the core: each imports from earlier sets only."""
 TESTED_HERE = {
+    "tests/benchmark/test_launches.py",
     "tests/control/test_authors_networks.py",
     "tests/control/test_paper.py",
     "tests/logs/test_fuzzed_logs.py",

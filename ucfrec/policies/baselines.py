@@ -368,7 +368,7 @@ class BoostedPolicy(ScoringPolicy):
             ("tree_leaves", torch.zeros(TREES, 2**_SPLITS)),
             ("base", torch.zeros(())),
             ("trees", torch.zeros((), dtype=torch.int64)),
-            ("effects", torch.zeros(n_items, 1 + sizes["state"] - self._context)),
+            ("effects", torch.zeros(n_items, 1 + max(0, sizes["state"] - self._context))),
         ):
             self.register_buffer(name, value)
 

@@ -42,8 +42,12 @@ _HIGHEST = 20.0
 TREES = 100
 LEAVES = 8
 """Most trees, and leaves of a tree."""
-_SETTINGS: dict[str, Any] = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
-_SETTINGS["early_stopping"] = True
+_SETTINGS: dict[str, Any] = {
+    "learning_rate": 0.2,
+    "max_iter": TREES,
+    "max_leaf_nodes": LEAVES,
+    "early_stopping": True,
+}
 _SPLITS = LEAVES - 1
 _LOGISTIC = ("highest", "mean", "scale", "weights", "bias")
 
@@ -337,7 +341,7 @@ class BoostedTrees:
         """(T, M) values of the trees' leaves."""
         columns = inputs.double().T.contiguous()
         at_most = torch.le(columns[self._numbers], self._thresholds).float()
-        at_most = at_most.view(len(self._powers), len(self._leaves), len(inputs))
+        at_most = at_most.view(len(self._powers), len(self._leaves), -1)  # exported for any M
         # Numbers of leaves, which float32 has exactly.
         return self._leaves.gather(1, torch.tensordot(self._powers, at_most, 1).long())
 

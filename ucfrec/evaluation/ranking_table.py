@@ -33,8 +33,6 @@ from ucfrec.evaluation.ranking import (
     rank_steps,
 )
 from ucfrec.policies.baselines import (
-    BoostedConfig,
-    BoostedPolicy,
     ItemKNNConfig,
     ItemKNNPolicy,
     LikedOf,
@@ -44,7 +42,8 @@ from ucfrec.policies.baselines import (
 )
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.rows import ResultRow
-from ucfrec.runs.start import policy_sizes
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.start import new_policy, policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE = "rank"
@@ -152,10 +151,10 @@ def baselines(
     if train is not None:
         tie_break = 1e-6 * impressions.float() / impressions.float().max()
         rankers["item-knn"] = neighbour_ranker(train, tie_break)
-        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
-        boosted = BoostedPolicy(config, policy_sizes(train))
-        boosted.start_from(train)
-        boosted.make_solver(train, None, Path(), seed)()
+        context = {"policy.context": _KNN_HISTORY + 1, "policy.dim": 1}
+        boosted = new_policy(train, resolve_config("boosted", overrides=context, seed=seed))
+        if solve := boosted.make_solver(train, None, Path(), seed):
+            solve()
 
         def scores(steps: Steps) -> Tensor:
             windows = steps.store.windows(steps.episodes, steps.steps, _KNN_HISTORY + 1)

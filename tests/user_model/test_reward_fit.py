@@ -127,29 +127,6 @@ def test_items_are_described_by_what_users_differ_in(tmp_path: Path) -> None:
     torch.testing.assert_close(updated.vectors, model.vectors)
 
 
-@pytest.mark.parametrize("drifts", [True, False])
-def test_rows_of_before_the_items_changed_count_less(drifts: bool, tmp_path: Path) -> None:
-    planted = log(0, users=800)
-    day = np.repeat(np.arange(800), LENGTH) // 20  # 40 days, of which the last ten are held out
-    turned = np.random.default_rng(3).permutation(planted.of_item)
-    is_old = drifts & (day < 20)
-    moved = planted.predictor + is_old * (turned - planted.of_item)[planted.items]
-    columns = {"item": planted.items, "reward": clicks(planted._replace(predictor=moved))}
-    users = np.arange(800)
-    store = EpisodeStore.from_arrays(
-        columns | {"timestamp": day * 86_400_000},
-        np.full(800, LENGTH),
-        {"user": users, "split": np.where(users < 600, 0, 1)},
-        item_states(800),
-    )
-    model, report = fit_item_reward_model(*views(store), tmp_path / "first", seed=0)
-    correlation = np.corrcoef(model.item.numpy(), planted.of_item)[0, 1]
-    assert correlation > 0.9
-    assert (report.half_life is not None) == drifts
-    again = refit_item_reward_model(tmp_path / "first", views(store)[0], tmp_path / "again", 0)
-    torch.testing.assert_close(again.item, model.item, rtol=0.05, atol=0.05)
-
-
 def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
     planted = log(1, boredom=3.0, users=300)
     model, report = fit(tmp_path, planted, clicks(planted))

@@ -235,8 +235,6 @@ def describe_user_model(record: RunRecord) -> dict[str, object]:
         "reward: loss of item effects": reward.item_loss,
         "reward: loss of the model": reward.loss,
     }
-    if reward.half_life is not None:
-        rows["reward: rows count half after"] = f"{reward.half_life:g} hours"
     for effect in reward.effects:
         excluded = "" if effect.kept else ", excluded"
         rows[f"gain by {effect.effect}"] = f"{effect.gain:.5f} ± {effect.gain_error:.5f}{excluded}"

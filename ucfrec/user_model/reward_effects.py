@@ -22,7 +22,6 @@ from ucfrec.user_model.reward import (
     root_of_tastes,
 )
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
-from ucfrec.user_model.running import HALF_LIVES_OF_DEMAND, HOUR_MS
 
 EFFECTS = (
     *("running", "item", "user", "content", "affinity", "position", "above"),
@@ -250,27 +249,6 @@ class Design:
         """The effect `mean` alone, of the weighted mean of what is predicted."""
         mean = (self.weights * self.target).sum() / self.weights.sum()
         return {"mean": torch.logit(mean, _SMALLEST) if self.binary else mean}
-
-
-def choose_half_life(design: Design, held_out: Design, times: Tensor) -> float | None:
-    """Hours after which a row of a time (M,), ms, should count half so that effects of items alone
-    predict held-out rows best; None if that is not better than all alike by more than its error."""
-    losses = {}
-    for hours in (None, *HALF_LIVES_OF_DEMAND[:-1]):
-        faded = replace(design, weights=fade_rows(times, hours))
-        effects = fit_effects(faded, faded.mean_effect(), {"item": _SPREADS[_FIRST]})
-        losses[hours] = held_out.loss(held_out.predictor(effects)).double()
-    best = min(losses, key=lambda hours: float(losses[hours].mean()))
-    gain, error = mean_gain(losses[None], losses[best])
-    return best if gain > error else None
-
-
-def fade_rows(times: Tensor, half_life: float | None) -> Tensor:
-    """(M,) float32 how many rows each row of a time (M,), ms, counts for: one in the mean."""
-    if half_life is None:
-        return torch.ones(len(times))
-    weights = torch.exp2((times - times.max()).double() / (HOUR_MS * half_life))
-    return (weights / weights.mean()).float()
 
 
 def fit_effects(

@@ -30,8 +30,6 @@ from ucfrec.user_model.reward_effects import (
     Beginning,
     Design,
     EffectSearch,
-    choose_half_life,
-    fade_rows,
     fit_effects,
 )
 from ucfrec.user_model.reward_report import (
@@ -89,8 +87,7 @@ def fit_item_reward_model(
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
-    than the standard error of the decrease. They also choose how much less older rows count, unless
-    running rates say what is recent.
+    than the standard error of the decrease.
 
     Where hardly any validation row is of a user with training rows, the model is for new users. A
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
@@ -113,10 +110,7 @@ def fit_item_reward_model(
     set_statistics(model, rows, held_out, train)
     design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
-    later = Design.of(model, held_out)
-    half_life = choose_half_life(design, later, rows.times) if model.rates is None else None
-    design = replace(design, weights=fade_rows(rows.times, half_life))
-    search = EffectSearch(design, later, begin)
+    search = EffectSearch(design, Design.of(model, held_out), begin)
     if search.of_new_users:
         rows, held_out = (RewardRows.of(v, MEMORY, _MAX_ROWS, seed) for v in (train, validation))
         search.sessions = model, rows.history, held_out.history
@@ -142,7 +136,6 @@ def fit_item_reward_model(
     report = ItemRewardReport(
         effects=search.report(),
         new_users=search.new_users,
-        half_life=half_life,
         base_loss=search.base_loss,
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),
@@ -166,7 +159,7 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     _take_turn(model, first, FITTED)
     set_statistics(model, rows, rows, store)
-    design = Design.of(model, rows, fade_rows(rows.times, report.half_life))
+    design = Design.of(model, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     if report.new_users:

@@ -42,8 +42,6 @@ class RewardRows:
     """(M,) float32, in reward units."""
     observations: int
     """O, the last numbers of the states: what was observed beside the session itself."""
-    times: Tensor
-    """(M,) int64 ms; 0 without times."""
     offer: Offer | None
     """What was on offer; None for everything."""
     above: Tensor
@@ -80,9 +78,6 @@ class RewardRows:
         users = np.full(view.n_episodes, -1)
         if view.has_users:
             users = view.episode_values(schema.USER).astype(np.int64)
-        times = np.zeros(len(steps), dtype=np.int64)
-        if schema.TIMESTAMP in view.record.columns:
-            times = view.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
@@ -90,7 +85,6 @@ class RewardRows:
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
-            torch.from_numpy(times),
             view.offer(episodes, steps),
             torch.from_numpy(view.items_above(episodes, steps, PLACES)),
         )
@@ -185,8 +179,6 @@ class ItemRewardReport:
     loss: float
     new_users: bool = False
     """Whether held-out rows are of users without training rows, and no effects of users kept."""
-    half_life: float | None = None
-    """Hours after which a training row counts half; None if all count alike."""
 
     @property
     def kept(self) -> Mapping[str, float]:

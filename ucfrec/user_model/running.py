@@ -19,7 +19,7 @@ from ucfrec.episodes.item_table import ALWAYS
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.store import EpisodeStore
 
-HOUR_MS = 3_600_000
+_HOUR_MS = 3_600_000
 HALF_LIVES = (6.0, 24.0, 96.0, math.inf)
 """Hours after which a row counts half, one rate each."""
 HALF_LIVES_OF_DEMAND = (6.0, 24.0, 96.0, 384.0, 1536.0, 6144.0, math.inf)
@@ -51,7 +51,7 @@ class TimeBins(NamedTuple):
         """Bins of the steps of a view, of an hour or more, that have `numbers` numbers each."""
         times = view.column(schema.TIMESTAMP)
         begin, span = int(times.min()), int(times.max() - times.min()) + 1
-        number = min(max(1, _ENTRIES // numbers - 1), -(-span // HOUR_MS))
+        number = min(max(1, _ENTRIES // numbers - 1), -(-span // _HOUR_MS))
         return cls(begin, -(-span // number), number)
 
     def rows(self, times: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class TimeBins(NamedTuple):
     def decay(self, sums: Float64Array, hours: float) -> Float64Array:
         """Of sums (T, n) by bin, those (T + 1, n) until the begin of each bin, and after the last,
         where what is `hours` old counts half."""
-        factor = 0.5 ** (self.width / HOUR_MS / hours)
+        factor = 0.5 ** (self.width / _HOUR_MS / hours)
         totals = np.zeros((len(sums) + 1, sums.shape[1]))
         for number, values in enumerate(sums):
             totals[number + 1] = factor * totals[number] + values
@@ -164,6 +164,6 @@ def fit_mixture(shares: Float64Array, later: Float64Array) -> Float64Array:
 
 def _ages(times: Tensor, begin: Tensor) -> Tensor:
     """(..., `AGES`) of items at times (...), which are available from `begin` (...), in ms."""
-    days = ((times - begin) / (24 * HOUR_MS)).clamp(0, _OLDEST).float()
+    days = ((times - begin) / (24 * _HOUR_MS)).clamp(0, _OLDEST).float()
     days = torch.where(begin == ALWAYS[0], 0.0, days)
     return torch.stack([days, torch.log1p(24 * days)], dim=-1)

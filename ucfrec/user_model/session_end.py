@@ -341,7 +341,7 @@ class BoostedTrees:
         """(T, M) values of the trees' leaves."""
         columns = inputs.double().T.contiguous()
         at_most = torch.le(columns[self._numbers], self._thresholds).float()
-        at_most = at_most.unflatten(0, (len(self._powers), len(self._leaves)))
+        at_most = at_most.view(len(self._powers), len(self._leaves), at_most.shape[1])
         # Numbers of leaves, which float32 has exactly.
         return self._leaves.gather(1, torch.tensordot(self._powers, at_most, 1).long())
 

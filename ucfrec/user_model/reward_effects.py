@@ -409,6 +409,9 @@ class EffectSearch:
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
     """For new users: the model, whose `tastes` are set, and what training and held-out rows saw."""
 
+    follows_tastes = False
+    """Whether the vectors of items are turned by how users differ."""
+
     def __init__(
         self,
         design: Design,
@@ -476,7 +479,7 @@ class EffectSearch:
             self.item_loss = float(losses.mean())
         if gain > error:
             self.effects, self.losses, self.kept[name] = effects, losses, number
-            if name == "affinity" and not self._begin.effects:
+            if name == "affinity" and self.follows_tastes:
                 self._follow_tastes()
 
     def _follow_tastes(self) -> None:
@@ -515,7 +518,6 @@ class EffectSearch:
     def take(self, search: "EffectSearch") -> None:
         """Fit the effects that `search` keeps, with its spreads, to all training rows."""
         self._tried = list(search._tried)
-        self._multiply_vectors(search.turn)
         self.kept = {name: number for name, number in search.kept.items() if name == "item"}
         self.fit_to(self.design)
         self.item_loss = float(self.losses.mean())
@@ -539,7 +541,6 @@ class EffectSearch:
         """Let the sessions tell tastes, whose covariance has the root, beside `effects`."""
         assert self.sessions is not None
         model, *histories = self.sessions
-        model.vectors.copy_(self.design.vectors)
         usual = self.effects["mean"] + self.effects.get("item", torch.zeros(()))
         if "content" in self.effects:
             usual = usual + self.design.sum_content(self.effects["content"])

@@ -116,6 +116,8 @@ def fit_item_reward_model(
         search.sessions = model, rows.history, held_out.history
     elif begin.effects:
         search = EffectSearch(_select_some(design, seed), search.held_out, begin)
+    else:
+        search.follows_tastes = True
     none = rows.rewards.new_zeros(0)  # the design has what it needs of states and history
     rows = replace(rows, states=none, history=Shown(none, none))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
@@ -129,7 +131,7 @@ def fit_item_reward_model(
             if name == CHEAP[-1] and not begin.effects:
                 lasting.adjust()
             bar.update()
-        if not begin.effects:
+        if search.follows_tastes:
             search.adjust()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
@@ -190,7 +192,6 @@ def fit_training_users(
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
-    _take_turn(model, first, _USERS_FITTED)
     set_statistics(model, rows, rows, train)
     # What the session shows of tastes is known already: states are features and observations.
     model.state_std[: states.size - states.user_features.shape[1]] = torch.inf
@@ -207,7 +208,7 @@ def fit_training_users(
     held_out = search.held_out
     scores = held_out.predictor(search.effects)
     line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
-    search.fit_to(design.turned(search.turn))
+    search.fit_to(design)
     report = TrainingUsersReport(line, search.report())
     search.save(file, model, report)
     return model, report

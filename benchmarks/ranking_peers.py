@@ -148,14 +148,8 @@ def main() -> None:
             how, out = ["--policy", policy, "--seed", str(seed)], options.out / f"{policy}-{seed}"
             print_row(policy, seed, rank_with_ucfrec(options.out, out, how))
             if updates:
-                how += [
-                    "--no-refit",
-                    "--set",
-                    f"train.steps={updates}",
-                    "--set",
-                    "train.patience=0",
-                ]
-                how += ["--set", f"train.batch_size={BATCH}"]
+                settings = f"train.steps={updates}", "train.patience=0", f"train.batch_size={BATCH}"
+                how += ["--no-refit", *(word for text in settings for word in ("--set", text))]
                 out = out.with_name(f"{out.name}-{updates}")
                 print_row(
                     f"{policy}, {updates} updates", seed, rank_with_ucfrec(options.out, out, how)

@@ -159,6 +159,9 @@ def test_returns_of_sessions_are_those_of_plain_pandas(tmp_path: Path) -> None:
     assert by_item.conclusion == "b is worse than a"
     days = compare_arms([tmp_path / "log.parquet"], gap_minutes=600)
     assert sum(days.units) == 400
+    for wrong in ({"per": "user"}, {"gap_minutes": float("inf")}, {"gap_minutes": 0.0}):
+        with pytest.raises(InputError, match="give"):
+            compare_arms([tmp_path / "log.parquet"], **wrong)  # type: ignore[arg-type]
     frame.drop(columns="timestamp").to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match=r"no column 'timestamp' \(sessions, or give per item"):
         compare_arms([tmp_path / "log.parquet"])

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from statistics import NormalDist
 from tempfile import gettempdir
-from typing import Literal
+from typing import Literal, get_args
 
 import pandas as pd
 
@@ -32,6 +32,7 @@ MISMATCH = 0.001
 _LARGEST = 1e100
 """Values beyond are refused, as infinite ones are: their squares would not be finite."""
 Per = Literal["session", "item"]
+_LONGEST = 1e9
 _NAMED = 3
 """Most users of several arms that are named."""
 
@@ -202,7 +203,9 @@ def compare_arms(
     """
     fault = f"expected is {expected}; give a difference above 0, and below {_LARGEST:g}"
     require(expected is None or 1 / _LARGEST < expected < _LARGEST, fault)
-    require(gap_minutes > 0, f"gap_minutes is {gap_minutes}; give minutes above 0")
+    require(per in get_args(Per), f"per is {per!r}; give 'session' or 'item'")
+    fault = f"gap_minutes is {gap_minutes}; give minutes above 0, and below {_LONGEST:g}"
+    require(0 < gap_minutes < _LONGEST, fault)
     files = log_files(paths)
     name = first_and_more(files)
     sum_up = partial(_sum_by_user, files, memory_limit, gap_minutes if per == "session" else None)

@@ -355,7 +355,7 @@ class BoostedPolicy(ScoringPolicy):
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         n_items, splits = sizes["items"], (TREES, _SPLITS)
-        self._context = 3 * sizes["action"] + 2
+        self._context = 3 * sizes["action"] + 2  # where features of users begin in `ItemStates`
         for name, value in (
             ("reward_low", torch.zeros(())),
             ("reward_high", torch.zeros(())),

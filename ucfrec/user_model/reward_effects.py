@@ -559,8 +559,7 @@ class EffectSearch:
         self.held_out = add_tastes(self.held_out, histories[1])
 
     def fit_to(self, design: Design) -> None:
-        """Fit the effects that were kept to other rows, with vectors as the search has them, from
-        those of an earlier state if any."""
+        """Fit the effects that were kept to other rows, from those of an earlier state if any."""
         start, self.design = design.mean_effect() | self._begin.effects, design
         self.effects = fit_effects(design, start, self._spreads, self._fixed)
         self.losses = self._losses(self.effects)

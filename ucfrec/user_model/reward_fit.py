@@ -294,8 +294,9 @@ def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]
 
 def _take_turn(model: ItemRewardModel, first: Path | None, name: str) -> None:
     """Turn the vectors as an earlier fit in a folder did, if there is one."""
-    if first is not None and (first / name).exists():
-        model.turn.copy_(load_tensors(first / name)[0]["turn"])
+    if first is not None and (file := first / name).exists():
+        with damage_explained(file, REMEDY):
+            model.turn.copy_(load_tensors(file)[0]["turn"])
 
 
 def _select_some(design: Design, seed: int) -> Design:

@@ -124,14 +124,15 @@ class Budget:
 
     def shorten(self, method: Method, presets: Presets | None = None) -> tuple[str, ...]:
         """Settings of a training that keeps those of a method and its presets but for the number of
-        updates, if the budget's is smaller, in proportion that of the warm-up, and how often it is
-        validated."""
+        updates, if the budget's is smaller, in proportion that of the warm-up, how often it is
+        validated, and the precision."""
         preset = resolve_config(method.policy, presets=presets).train
         values = dict(setting.split("=", 1) for setting in self.settings)
         steps = min(int(values.get("train.steps", preset.steps)), preset.steps)
         warmup = preset.warmup * steps // preset.steps
-        rarely = tuple(s for s in self.settings if s.startswith("train.validate_every="))
-        return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *rarely, *method.settings)
+        kept = ("train.validate_every=", "train.precision=")
+        others = tuple(s for s in self.settings if s.startswith(kept))
+        return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *others, *method.settings)
 
     def narrow(
         self,

@@ -21,7 +21,13 @@ from ucfrec.policies.base import (
     init_linear,
 )
 from ucfrec.policies.dt import attend
-from ucfrec.policies.ucf import Dropout, TokenEmbedding, interleave, visible_tokens
+from ucfrec.policies.ucf import (
+    Dropout,
+    TokenEmbedding,
+    interleave,
+    sum_shifted,
+    visible_tokens,
+)
 from ucfrec.settings import require, settings_table
 
 
@@ -58,16 +64,16 @@ class DCPolicy(SequencePolicy):
         """Features (B, K, d): outputs at the tokens s_t."""
         hidden = self.dropout(interleave(self.embed(windows, self.head.embed(windows.actions))))
         valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
-        for block in self.blocks:
+        *first_blocks, last = self.blocks
+        for block in first_blocks:
             hidden = block(hidden, valid)
-        return self.final_norm(hidden[:, 1::3])  # type: ignore[no-any-return]
+        return self.final_norm(last(hidden, valid, slice(1, None, 3)))  # type: ignore[no-any-return]
 
 
 class _ConvBlock(nn.Module):
     def __init__(self, config: DCConfig) -> None:
         super().__init__()
         dim = config.dim
-        self.reach = config.kernel - 1
         self.mixer_norm = nn.LayerNorm(dim)
         self.mixers = nn.ModuleList(
             nn.Conv1d(dim, dim, config.kernel, stride=3, groups=dim) for _ in range(3)
@@ -80,12 +86,20 @@ class _ConvBlock(nn.Module):
             Dropout(config.dropout),
         )
 
-    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
-        normed = self.mixer_norm(hidden).masked_fill(~valid, 0.0).transpose(1, 2)  # (B, d, 3K)
-        padded = F.pad(normed, (self.reach, 0))
-        # Each modality has its own filter; stride 3 computes only the outputs of that modality.
-        mixed = [conv(padded[..., i:]).transpose(1, 2) for i, conv in enumerate(self.mixers)]
-        hidden = hidden + interleave(mixed)
+    def forward(
+        self,
+        hidden: Tensor,
+        valid: Tensor,
+        rows: slice = slice(None),
+    ) -> Tensor:
+        """The `rows` (B, M, d), or all, of what the block makes of tokens (B, 3K, d)."""
+        normed = self.mixer_norm(hidden).masked_fill(~valid, 0.0)
+        # Each modality has its own filter: taps (kernel, 3K, d), bias (3K, d).
+        steps = hidden.shape[1] // 3
+        taps = torch.cat([conv.weight for conv in self.mixers], 1).permute(2, 1, 0)
+        bias = torch.stack([conv.bias for conv in self.mixers])
+        mixed = sum_shifted(normed, taps.repeat(1, steps, 1), bias.repeat(steps, 1))
+        hidden = (hidden + mixed)[:, rows]
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]
 
 

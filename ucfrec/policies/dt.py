@@ -61,7 +61,7 @@ class DTPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        return self.attend(self.tokens(windows), windows.mask)[:, 1::3]
+        return self.attend(self.tokens(windows), windows.mask, slice(1, None, 3))
 
     def tokens(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens R_t, s_t and a_t, (B, K, d) each, from normalised windows."""

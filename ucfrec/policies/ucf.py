@@ -294,12 +294,25 @@ class CausalDepthwise(nn.Conv1d):
         """Map (B, K, d) to (B, K, d); steps where the mask (B, K) is false count as zeros."""
         steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)
         taps = self.weight[:, 0].T.contiguous()  # strided factors take three times as long
-        return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
+        return sum_shifted(steps, taps[:, None], self.bias[None])  # type: ignore[index]
+
+
+def sum_shifted(
+    steps: Tensor,
+    taps: Tensor,
+    bias: Tensor,
+) -> Tensor:
+    """A causal depthwise convolution, Σ_n x_{t − n} ⊙ w_{n, t} + b_t, as (B, K, d).
+
+    Args:
+        steps: x (B, K, d); those before the first are zeros.
+        taps: w (n, 1, d), the last of the step itself; (n, K, d) if steps differ in it.
+        bias: b (1, d) or (K, d).
+    """
+    return _ShiftedProducts.apply(steps, taps, bias)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _ShiftedProducts(torch.autograd.Function):
-    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, of steps x (B, K, d), taps w (3, d) and a bias b (d,)."""
-
     @staticmethod
     def forward(
         ctx: Any,
@@ -308,21 +321,30 @@ class _ShiftedProducts(torch.autograd.Function):
         bias: Tensor,
     ) -> Any:
         ctx.save_for_backward(steps, taps)
-        out = torch.addcmul(bias, steps, taps[2])
-        for back in (1, 2):
-            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
+        out = torch.addcmul(bias, steps, taps[-1])
+        for back in range(1, len(taps)):
+            out[:, back:].addcmul_(steps[:, :-back], _rows(taps[-1 - back], back))
         return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
         steps, taps = ctx.saved_tensors
-        of_steps, of_taps = gradient * taps[2], torch.empty_like(taps)
-        of_taps[2] = (gradient * steps).sum((0, 1))
-        for back in (1, 2):
+        over = (0, 1) if taps.shape[1] == 1 else (0,)
+        of_steps, of_taps = gradient * taps[-1], torch.zeros_like(taps)
+        of_taps[-1] = (gradient * steps).sum(over)
+        for back in range(1, len(taps)):
             later, earlier = gradient[:, back:], steps[:, :-back]
-            of_steps[:, :-back].addcmul_(later, taps[2 - back])
-            of_taps[2 - back] = (later * earlier).sum((0, 1))
-        return of_steps, of_taps, gradient.sum((0, 1))
+            of_steps[:, :-back].addcmul_(later, _rows(taps[-1 - back], back))
+            _rows(of_taps[-1 - back], back)[:] = (later * earlier).sum(over)
+        return of_steps, of_taps, gradient.sum(over).view(-1, gradient.shape[2])
+
+
+def _rows(
+    taps: Tensor,
+    back: int,
+) -> Tensor:
+    """The taps (1, d) of all steps, or of those of (K, d) that have a step `back` before them."""
+    return taps if len(taps) == 1 else taps[back:]
 
 
 class ConvStream(nn.Module):

@@ -4,6 +4,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -78,6 +79,8 @@ class ControlGridOptions(GridOptions):
     """Folder of the HDF5 files."""
     context: Annotated[Sequence[tuple[str, int]], context_given, "METHOD=STEPS"] = ()
     """Steps of history of a method; repeatable (default: the budget's)"""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16 where the processor has its products (avx512_bf16, AMX, GPUs)"""
     budget: Literal["small", "medium", "full"] = "small"
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
     times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
@@ -113,8 +116,11 @@ class ControlGridOptions(GridOptions):
     def narrow_budget(
         self, budget: Budget, files: Sequence[str] = (), evaluation_seed: int | None = None
     ) -> Budget:
-        """`budget` with the seeds and contexts of the options."""
+        """`budget` with the seeds, contexts and precision of the options."""
         budget = budget.narrow(files, self.seeds, evaluation_seed=evaluation_seed)
+        if self.precision != "float32":
+            precision = f"train.precision={self.precision}"
+            budget = replace(budget, settings=(*budget.settings, precision))
         return set_contexts(budget, dict(self.context))
 
 

@@ -76,7 +76,7 @@ class _ConvBlock(nn.Module):
         dim = config.dim
         self.mixer_norm = nn.LayerNorm(dim)
         self.mixers = nn.ModuleList(
-            nn.Conv1d(dim, dim, config.kernel, stride=3, groups=dim) for _ in range(3)
+            nn.Conv1d(dim, dim, config.kernel, groups=dim) for _ in range(3)
         )
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
@@ -96,8 +96,8 @@ class _ConvBlock(nn.Module):
         normed = self.mixer_norm(hidden).masked_fill(~valid, 0.0)
         # Each modality has its own filter: taps (kernel, 3K, d), bias (3K, d).
         steps = hidden.shape[1] // 3
-        taps = torch.cat([conv.weight for conv in self.mixers], 1).permute(2, 1, 0)
-        bias = torch.stack([conv.bias for conv in self.mixers])
+        weights, biases = zip(*(conv.parameters() for conv in self.mixers), strict=True)
+        taps, bias = torch.cat(weights, 1).permute(2, 1, 0), torch.stack(biases)
         mixed = sum_shifted(normed, taps.repeat(1, steps, 1), bias.repeat(steps, 1))
         hidden = (hidden + mixed)[:, rows]
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]

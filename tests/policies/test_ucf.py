@@ -290,6 +290,25 @@ def test_shifted_products_are_the_convolution(padded: bool, length: int) -> None
     torch.testing.assert_close(*gradients)
 
 
+@pytest.mark.parametrize("length", [1, 5])
+def test_each_modality_of_dc_has_its_own_convolution(length: int) -> None:
+    block: Any = build("dc", VECTORS).blocks[0]  # type: ignore[index]
+    tokens = torch.randn(3, 3 * length, 16, requires_grad=True)
+    padded = F.pad(block.mixer_norm(tokens).mT, (5, 0))
+    mixed = tokens + interleave(
+        [
+            F.conv1d(padded[..., first:], conv.weight, conv.bias, stride=3, groups=16).mT
+            for first, conv in enumerate(block.mixers)
+        ]
+    )
+    right = mixed + block.mlp(block.mlp_norm(mixed))
+    found = block(tokens, torch.ones(3, 3 * length, 1, dtype=torch.bool))
+    torch.testing.assert_close(found, right)
+    inputs = (tokens, *block.mixers.parameters())
+    gradients = (torch.autograd.grad(out.square().sum(), inputs) for out in (found, right))
+    torch.testing.assert_close(*gradients)
+
+
 @pytest.mark.parametrize("p", [0.1, 0.5, 0.93])
 def test_the_given_share_is_dropped_and_the_mean_stays(p: float) -> None:
     torch.manual_seed(0)

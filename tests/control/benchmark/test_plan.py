@@ -19,8 +19,8 @@ from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
-from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
-from ucfrec_control.commands.options import context_given
+from ucfrec_control.benchmark.plan import SEARCHED, score_cells, settings_of
+from ucfrec_control.commands.options import ControlGridOptions, context_given
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.training.evaluate import load_run
@@ -108,11 +108,13 @@ def test_what_is_no_context_is_refused(given: str) -> None:
         context_given(given)
 
 
-def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
+def test_methods_have_the_context_and_the_precision_that_are_asked_for(tmp_path: Path) -> None:
     write_made(tmp_path)
     medium = replace(budget_of(MAIN, "medium"), tasks=(MADE,), tasks_of={})
-    budget = set_contexts(medium, {"dc-wo-time": 20})
-    cells = score_cells(tmp_path, tmp_path / "out", budget, MAIN)
+    options = ControlGridOptions(context=[("dc-wo-time", 20)], precision="bfloat16")
+    budget = options.narrow_budget(medium)
+    cells = [*score_cells(tmp_path, tmp_path / "out", budget, MAIN)]
+    assert {cell.config.train.precision for cell in cells} == {"bfloat16"}
     contexts = {cell.method: cell.config.policy.context for cell in cells}
     assert contexts.pop("dc-wo-time") == 20
     assert {contexts[name] for name in ("ucf", "dt-wo-time")} == {8}

@@ -11,7 +11,7 @@ writes to the folder `news`:
 - `news.toml`: the mapping for `ucfrec prepare --mapping`.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -113,4 +113,8 @@ def make_log(folder: Path, sessions: int = 6_000, seed: int = 0) -> News:
 
 
 if __name__ == "__main__":
-    make_log(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description="Write a simulated publisher's log.")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("news"))
+    make_log(target := parser.parse_args().folder)
+    for file in sorted(target.iterdir()):
+        print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

@@ -11,7 +11,7 @@ Every user rates a film once. Films come out all the time: interest in one halve
 down to a rest that lasts, and who has rated one part of a series soon rates the next.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -71,4 +71,8 @@ def make_log(folder: Path, seed: int = 0, drift: bool = True) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    make_log(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description="Write a simulated log of ratings.")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("films"))
+    make_log(target := parser.parse_args().folder)
+    for file in sorted(target.iterdir()):
+        print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

@@ -15,7 +15,7 @@ The log has the usual faults: 1% of the rows are repeated, some identifiers are 
 visitor is a bot.
 """
 
-import sys
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,7 +134,8 @@ def make_log(folder: Path, sessions: int = 12_000, seed: int = 0) -> Shop:
 
 
 if __name__ == "__main__":
-    target = Path(sys.argv[1] if len(sys.argv) > 1 else "shop")
-    make_log(target)
+    parser = argparse.ArgumentParser(description="Write a simulated shop's log.")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("shop"))
+    make_log(target := parser.parse_args().folder)
     for file in sorted(target.iterdir()):
         print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

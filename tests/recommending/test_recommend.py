@@ -288,7 +288,7 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
     "misspelt": (
         lambda log: log.rename(columns={"reward": "rewards"}),
-        r"no column 'reward' \(for the reward\); did you mean 'rewards'",
+        r"no column 'reward' \(for the reward; name it .*\); did you mean 'rewards'",
     ),
     "values of several types": (
         lambda log: log.assign(user_id=[1, "b", *log.user_id[2:]]),

@@ -243,6 +243,7 @@ def not_finite(vector: str) -> str:
     return f"{vector} IS NULL OR NOT {finite}"
 
 
+_REWARD = "for the reward; name it with --reward, or give --reward 1 if users chose every row"
 _Values = dict[str, tuple[str, str]]
 """Log column to its (SQL, DuckDB type)."""
 
@@ -292,7 +293,7 @@ def _bind_reward(
 ) -> tuple[Table, Bound]:
     """The reward, and the table in which a column of text without a value has no type."""
     try:
-        return table, bind(connection, table, "for the reward", reward)
+        return table, bind(connection, table, _REWARD, reward)
     except InputError:
         words = re.findall(r"\w+", reward.casefold())
         texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in words]
@@ -302,7 +303,7 @@ def _bind_reward(
         (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
         empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
         table = replace(table, types=tuple((dict(table.types) | empty).items()))
-        return table, bind(connection, table, "for the reward", reward)
+        return table, bind(connection, table, _REWARD, reward)
 
 
 def cast_value(

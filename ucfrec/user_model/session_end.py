@@ -48,6 +48,8 @@ _SETTINGS: dict[str, Any] = {
     "max_leaf_nodes": LEAVES,
     "early_stopping": True,
 }
+_ROWS = 256
+"""Rows that trees are evaluated on at once, whose numbers the processor keeps at hand."""
 _SPLITS = LEAVES - 1
 _LOGISTIC = ("highest", "mean", "scale", "weights", "bias")
 
@@ -340,10 +342,14 @@ class BoostedTrees:
     def _find_leaves(self, inputs: Tensor) -> Tensor:
         """(T, M) values of the trees' leaves."""
         columns = inputs.double().T.contiguous()
-        at_most = torch.le(columns[self._numbers], self._thresholds).float()
-        at_most = at_most.view(len(self._powers), len(self._leaves), at_most.shape[1])
-        # Numbers of leaves, which float32 has exactly.
-        return self._leaves.gather(1, torch.tensordot(self._powers, at_most, 1).long())
+        leaves = []
+        for block in columns.split(_ROWS, 1):
+            at_most = torch.le(block[self._numbers], self._thresholds).float()
+            at_most = at_most.view(len(self._powers), len(self._leaves), block.shape[1])
+            # Numbers of leaves, which float32 has exactly.
+            numbers = torch.tensordot(self._powers, at_most, 1).long()
+            leaves.append(self._leaves.gather(1, numbers))
+        return torch.cat(leaves, 1)
 
 
 def fit_trees(

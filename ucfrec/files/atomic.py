@@ -223,6 +223,27 @@ def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = Fa
         scratch.write_text(json_text(value, indent=2) + "\n", encoding="utf-8")
 
 
+def save_arrays(path: Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
+    """Write named arrays, contiguous, and metadata that JSON can represent as safetensors,
+    atomically; InputError if there is no space."""
+    from safetensors import SafetensorError  # imports NumPy
+    from safetensors.numpy import save_file
+
+    with atomic_file(path) as scratch:
+        scratch.touch()
+        mode = scratch.stat().st_mode
+        try:
+            # One entry: safetensors writes several in any order, and files of equal content are to
+            # be equal.
+            save_file(dict(arrays), scratch, metadata={"about": json.dumps(metadata)})
+        except SafetensorError as error:
+            raise InputError(
+                f"{path} cannot be written ({error}); free disk space and run the command again"
+            ) from None
+        # safetensors restricts its files to their owner; give them the usual permissions.
+        scratch.chmod(mode)
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file; the entry `checksum` of a sealed object is verified and excluded.
 

@@ -10,11 +10,10 @@ from typing import Annotated, Any, TypeVar
 import torch
 from pydantic import Field, TypeAdapter
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, json_text, require_file
+from ucfrec.files.atomic import json_text, require_file, save_arrays
 
 REMEDY = "restore it or train again"
 """What to do about a damaged file."""
@@ -29,27 +28,8 @@ _Module = TypeVar("_Module", bound=nn.Module)
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write named tensors and metadata that JSON can represent, atomically; InputError if there is
     no space."""
-    plain: dict[str, Tensor] = {}
-    places = set()
-    for name, tensor in tensors.items():
-        plain[name] = tensor.detach().contiguous().cpu()
-        place = plain[name].untyped_storage().data_ptr()
-        if place in places:  # safetensors refuses tensors that share memory
-            plain[name] = plain[name].clone()
-        places.add(place)
-    with atomic_file(path) as scratch:
-        scratch.touch()
-        mode = scratch.stat().st_mode
-        try:
-            # One entry: safetensors writes several in any order, and files of equal content are to
-            # be equal.
-            save_file(plain, scratch, metadata={"about": json.dumps(metadata)})
-        except SafetensorError as error:
-            raise InputError(
-                f"{path} cannot be written ({error}); free disk space and run the command again"
-            ) from None
-        # safetensors restricts its files to their owner; give them the usual permissions.
-        scratch.chmod(mode)
+    plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
+    save_arrays(path, {name: tensor.numpy() for name, tensor in plain.items()}, metadata)
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

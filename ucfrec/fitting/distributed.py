@@ -129,15 +129,9 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
 def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     """The sum over processes of sparse gradients times their weights."""
     rows, values = gradient.indices()[0], gradient.values() * weight
-    sizes = [
-        torch.zeros(
-            1,
-            dtype=torch.int64,
-            device=rows.device,
-        )
-        for _ in range(processes())
-    ]
-    distributed.all_gather(sizes, torch.tensor([len(rows)], device=rows.device))
+    size = torch.tensor([len(rows)], device=rows.device)
+    sizes = [torch.empty_like(size) for _ in range(processes())]
+    distributed.all_gather(sizes, size)
     counts = [int(size) for size in sizes]
     # Messages have to be of one size, that of the largest.
     joined = []
@@ -146,18 +140,6 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
         padded[: len(part)] = part
         parts = [torch.empty_like(padded) for _ in range(processes())]
         distributed.all_gather(parts, padded)
-        joined.append(
-            torch.cat(
-                [
-                    part[:n]
-                    for part, n in zip(
-                        parts,
-                        counts,
-                        strict=True,
-                    )
-                ]
-            )
-        )
-    return torch.sparse_coo_tensor(
-        joined[0].unsqueeze(0), joined[1], gradient.shape, check_invariants=False
-    )
+        joined.append(torch.cat([part[:n] for part, n in zip(parts, counts, strict=True)]))
+    places, summands = joined[0].unsqueeze(0), joined[1]
+    return torch.sparse_coo_tensor(places, summands, gradient.shape, check_invariants=False)

@@ -84,11 +84,7 @@ class Table:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def execute(self) -> None:
-        """Run the command.
-
-        Raises:
-            InputError: what the command line names cannot be used.
-        """
+        """Run the command. InputError if what the command line names cannot be used."""
         raise NotImplementedError
 
 

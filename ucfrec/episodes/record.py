@@ -112,12 +112,8 @@ class StoreRecord(Record):
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read and check the record of a store.
-
-        Raises:
-            InputError: the folder is not a store, its record is damaged, or a newer ucfrec wrote
-                it.
-        """
+        """Read and check the record of a store. InputError if the folder is not a store, its record
+        is damaged, or a newer ucfrec wrote it."""
         record = super().read(folder)
         names = (folder / f"shard-{n:05d}" for n in range(record.n_shards))
         shards = list(takewhile(Path.is_dir, names))

@@ -72,10 +72,7 @@ def load_weights(
     assign: bool = False,
 ) -> None:
     """Load `tensors`, which were read from `path`, into `module`; copied unless `assign`.
-
-    Raises:
-        InputError: they are the weights of another architecture.
-    """
+    InputError if they are the weights of another architecture."""
     try:
         module.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:
@@ -129,14 +126,11 @@ def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
     """Read `metrics.jsonl` in `folder`, also while the training is running.
 
     If a resumed training logged a step again, the later line is used. An incomplete last line is
-    ignored.
+    ignored. InputError if a line is not an object of a step and numbers.
 
     Returns:
         {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
         if the file does not exist.
-
-    Raises:
-        InputError: a line is not an object of a step and numbers.
     """
     path = folder / METRICS
     if not path.exists():

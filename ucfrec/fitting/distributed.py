@@ -39,11 +39,9 @@ def leads() -> bool:
 def joined() -> Iterator[None]:
     """Join the other processes of `torchrun`, if it started this one among several.
 
-    Communication is by gloo, and by NCCL between GPUs, of which each process takes its own.
-    A process that is not the leader has nothing to save: TERM ends it at once, whatever it does.
-
-    Raises:
-        InputError: another process of the training has ended.
+    Communication is by gloo, and by NCCL between GPUs, of which each process takes its own. A
+    process that is not the leader has nothing to save: TERM ends it at once, whatever it does.
+    InputError if another process of the training has ended.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
@@ -87,10 +85,7 @@ def leader_first() -> Iterator[None]:
 
 def share(whole: int) -> slice:
     """The part of `whole` windows of a batch, or of anything divided, that is this process's.
-
-    Raises:
-        InputError: there are fewer of them than processes.
-    """
+    InputError if there are fewer of them than processes."""
     if whole < processes():
         raise InputError(
             f"a batch of {whole} cannot be divided among {processes()} processes; set "

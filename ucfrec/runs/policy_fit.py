@@ -37,8 +37,8 @@ def fit_policy(
     callbacks: Callbacks = SILENT,
     augmented: AugmentedEpisodes | None = None,
 ) -> Fit:
-    """Train the policy in place, or resume its training. InputError as of `ucfrec.fitting.loop.fit`,
-    or if the batch has fewer windows than processes.
+    """Train the policy in place, or resume its training. InputError as of
+    `ucfrec.fitting.loop.fit`, or if the batch has fewer windows than processes.
 
     Args:
         validation: held-out episodes; None to keep the last weights.

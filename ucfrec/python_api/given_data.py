@@ -192,9 +192,9 @@ def open_files(
     as long as the block; None for files. InputError if a path is missing, or the frame cannot be
     used."""
     columns = _read_columns(mapping)
-    used, reward = columns_used(trained, columns), reward_of(trained)
+    needed, reward = columns_used(trained, columns), reward_of(trained)
     with scratch_folder(Path(gettempdir()), "frame") as scratch:
-        yield _find_files(logs, columns, partial(later_logs, trained), scratch, used, reward)
+        yield _find_files(logs, columns, partial(later_logs, trained), scratch, needed, reward)
 
 
 def read_histories(
@@ -230,18 +230,18 @@ def _find_files(
     columns: LogMapping,
     resolve: Callable[[Sequence[str | Path], LogMapping], Resolved],
     scratch: Path,
-    used: LogMapping,
+    needed: LogMapping,
     reward: str | None,
 ) -> tuple[tuple[Path, ...], LogMapping, Path | None]:
     """Files of logs, their mapping, and the file in `scratch` to which a frame is written: the
-    columns that are `used`, or that the `reward` reads."""
+    columns that are `needed`, or that the `reward` reads."""
     if isinstance(logs, LogFiles):
         return logs.files, columns.over(logs.mapping), None
     if _are_paths(logs):
         paths = [logs] if isinstance(logs, (str, Path)) else list(logs)
         return *resolve(paths, columns), None
     file = scratch / _FRAME
-    pq.write_table(log_table(logs, "data", used, reward), file)
+    pq.write_table(log_table(logs, "data", needed, reward), file)
     return (file,), columns, file
 
 

@@ -76,11 +76,8 @@ def estimate(
     """Estimate the discounted return of a policy from trajectories of the same robot.
 
     Of trajectories that the step limit ended, the last step is not regressed, because the state
-    after it is unknown; the behaviour's return goes on with the estimate there.
-
-    Raises:
-        InputError: `discount` is not in (0, 1), the store is of other sizes, or no trajectory has
-            two steps.
+    after it is unknown; the behaviour's return goes on with the estimate there. InputError if
+    `discount` is not in (0, 1), the store is of other sizes, or no trajectory has two steps.
     """
     if not 0 < discount < 1:
         raise InputError(f"--discount is {discount:g}; give a number between 0 and 1")

@@ -158,11 +158,8 @@ def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
 
 @random_state_kept()
 def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Test the effect of every dimension of the states of training episodes.
-
-    Raises:
-        InputError: there are too few episodes to hold some out.
-    """
+    """Test the effect of every dimension of the states of training episodes. InputError if there
+    are too few episodes to hold some out."""
     torch.manual_seed(seed)
     data = _Data(train, config, seed)
     shared = _fit_shared(data)

@@ -1,5 +1,6 @@
 """The explorer in a real browser, and without one: lists, errors, sliders, two runs, no scripts."""
 
+import asyncio
 import json
 import re
 import threading
@@ -16,12 +17,10 @@ from tests.recommending.test_recommend import SMALL, random_log
 from tests.support.browser import CHROMIUM, Browser
 from ucfrec import DecisionRule, Recommender
 
-pytest.importorskip("httpx")
+httpx = pytest.importorskip("httpx")
 pytest.importorskip("fastapi")
 uvicorn = pytest.importorskip("uvicorn")
 # After the check that they are installed.
-from fastapi.testclient import TestClient  # noqa: E402
-
 from ucfrec.errors import InputError  # noqa: E402
 from ucfrec.exploring.page import Explorer, application  # noqa: E402
 
@@ -62,8 +61,12 @@ def address(explorer: Explorer) -> Iterator[str]:
 
 
 def got(explorer: Explorer, path: str, host: str = "127.0.0.1", **given: str) -> Any:
-    client = TestClient(application(explorer, ["127.0.0.1"]), base_url=f"http://{host}")
-    return client.get(path, params=given)
+    async def ask() -> Any:
+        transport = httpx.ASGITransport(app=application(explorer, ["127.0.0.1"]))
+        async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
+            return await client.get(path, params=given)
+
+    return asyncio.run(ask())
 
 
 def test_the_page_works_without_scripts(explorer: Explorer) -> None:

@@ -103,7 +103,7 @@ def estimate(
         of_policy.converged and of_behaviour.converged,
         len(store.lengths) < _GROUPS,
     )
-    returns, half, value = model.logged_returns(of_behaviour.weights), 0.0, of_policy.value
+    returns, half, value = model.average_logged(of_behaviour.weights), 0.0, of_policy.value
     reasons = []
     if not converged:
         reasons.append("the regressions did not settle")
@@ -219,7 +219,7 @@ class _Model:
                 break
         return weights, float(first @ weights / count), converged
 
-    def logged_returns(self, weights: Float64Array) -> Float64Array:
+    def average_logged(self, weights: Float64Array) -> Float64Array:
         """Discounted returns (E,) of the logged trajectories; where the step limit cut one, its
         last step counts by Q."""
         steps = np.arange(len(self._rewards)) - np.repeat(self._starts, self._lengths)

@@ -28,7 +28,7 @@ NOTEBOOKS = re.compile(r"^docs/tutorials/(\w+)\.md$")
 
 
 @pytest.mark.parametrize(
-    ("page", "command"), [(page.name, command) for page in PAGES[1:] for command in page.commands()]
+    ("page", "command"), [(page.name, command) for page in PAGES for command in page.commands()]
 )
 def test_the_commands_parse(page: str, command: str) -> None:
     parse(command)

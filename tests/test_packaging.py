@@ -17,7 +17,6 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 GROUPS = {"console_scripts": PROJECT["scripts"], **PROJECT["entry-points"]}
 ENTRY_POINTS = [EntryPoint(name, at, key) for key in GROUPS for name, at in GROUPS[key].items()]
 
-
 DISTRIBUTIONS = {
     "annotated_types": "pydantic",
     "faiss": "faiss-cpu",

@@ -7,9 +7,6 @@ import pytest
 
 from ucfrec.commands.cli import main
 
-MODULE = """
-NUMBER = 7
-"""
 ENTRY_POINTS = """[ucfrec.simulators]
 number = my_things:NUMBER
 [ucfrec.datasets]
@@ -25,7 +22,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A distribution as pip leaves it, on the path."""
     info = tmp_path / "site" / "my_things-1.0.dist-info"
     info.mkdir(parents=True)
-    (info.parent / "my_things.py").write_text(MODULE)
+    (info.parent / "my_things.py").write_text("NUMBER = 7\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-things\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(info.parent))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.markdown import ROOT, Page, parse, run_python
+from tests.support.markdown import ROOT, Page, run_python
 
 README = Page("README.md")
 
@@ -24,11 +24,6 @@ def test_the_python_example_prints_what_is_shown(tmp_path: Path) -> None:
     assert [row[:2] for row in recommended] == [(0, 1), (0, 2), (1, 1), (1, 2)]
     assert all(user % 2 == item % 2 for user, _, item in recommended)  # the planted pattern
     assert (tmp_path / "my-policy" / "run.json").is_file()
-
-
-@pytest.mark.parametrize("command", README.commands())
-def test_the_commands_parse(command: str) -> None:
-    parse(command)
 
 
 def test_the_walk_through_has_its_commands() -> None:

@@ -28,11 +28,8 @@ def plugin_names(group: str) -> list[str]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import the plugin `name` of the entry-point group `ucfrec.<group>`.
-
-    Raises:
-        InputError: no such plugin is installed, or several, or it is broken or of another type.
-    """
+    """Import the plugin `name` of the entry-point group `ucfrec.<group>`. InputError if no such
+    plugin is installed, or several, or it is broken or of another type."""
     entry = _entry(group, name)
     kind, module, title = _ONE_OF[group]
     try:

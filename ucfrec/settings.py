@@ -227,10 +227,7 @@ def require_number(name: str, value: object) -> float:
 
 def require_ids(name: str, value: object, of: str) -> Array:
     """The identifiers (N,) of a list, a series, an array, a set or an iterator, at least one.
-
-    Raises:
-        InputError: `value` is something else, is empty, or holds lists; `of` is e.g. "user_id".
-    """
+    InputError if `value` is something else, is empty, or holds lists; `of` is e.g. "user_id"."""
     if not _is_list(value) or getattr(value, "ndim", 1) != 1:
         raise InputError(f"{name} is {shown(value)}; give a list of {of}s")
     ids = list(cast("Iterable[object]", value))
@@ -260,11 +257,8 @@ def require_list(
     what: str,
     *kinds: type[_Value],
 ) -> list[_Value]:
-    """The values of an argument that is one of `kinds`, or any number of them.
-
-    Raises:
-        InputError: one has another type; `what` is one of them in words, e.g. "a Recommender".
-    """
+    """The values of an argument that is one of `kinds`, or any number of them. InputError if one
+    has another type; `what` is one of them in words, e.g. "a Recommender"."""
     alone = isinstance(argument, kinds) or not _is_list(argument)
     values = [argument] if alone else list(cast("Iterable[object]", argument))
     for value in values:

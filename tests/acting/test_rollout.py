@@ -1,5 +1,6 @@
 """Rollouts and metrics against plain bookkeeping; uniform actions, allowed and evenly."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -102,17 +103,8 @@ def test_bootstrap_interval_is_the_normal_one_for_many_episodes() -> None:
 # Uniform actions.
 
 
-class Bare(gym.Env[np.ndarray, np.ndarray]):
-    """Nothing but an action space."""
-
-    observation_space = gym.spaces.Box(-1, 1, (1,))
-
-    def __init__(self, actions: gym.spaces.Space[np.ndarray]) -> None:
-        self.action_space = actions
-
-
-def uniform(actions: gym.spaces.Space[np.ndarray], seed: int = 0) -> Uniform:
-    return Uniform(SyncVectorEnv([lambda: Bare(actions)]), seed)
+def uniform(actions: gym.spaces.Space[Any]) -> Uniform:
+    return Uniform(SimpleNamespace(single_action_space=actions), 0)  # type: ignore[arg-type]
 
 
 LIVE = np.ones(3000, dtype=np.bool_)

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from ucfrec.episodes.store import EpisodeStore
+
 _EXTRA = ("h5py", "matplotlib", "minari", "mujoco")
 collect_ignore_glob = [] if all(map(find_spec, _EXTRA)) else ["*"]
 
@@ -24,3 +26,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run = ("--out", folder / f"{data}-run", "--policy", policy, "--seed", 3)
         control("train", folder / data, *run, *set_options())
     return folder
+
+
+@pytest.fixture(scope="session")
+def store(folder: Path) -> EpisodeStore:
+    return EpisodeStore.open(folder / "store")

@@ -2,16 +2,14 @@
 
 import ast
 import re
-from functools import reduce
-from importlib import import_module
-from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import Any
 
 import pytest
 
 from tests.support.markdown import Page
 from ucfrec.policies.ucf import UCFPaperPolicy
-from ucfrec.runs.config import Config, resolve_config
+from ucfrec.runs.config import resolve_config
 from ucfrec_control.commands.reproduce import PARTS
 from ucfrec_control.training.train import find_preset
 
@@ -26,21 +24,6 @@ SETTINGS = [row for row in ROWS if re.fullmatch(r"`(policy|train|crm|csg|augment
 TASKS = (("halfcheetah", "medium"), ("hopper", "medium"), ("antmaze", ""))
 
 
-def find(name: str) -> Any:
-    """A module, or what is in one."""
-    path = name if name.startswith("ucfrec") else f"ucfrec.{name}"
-    parts = path.split(".")
-    known = next(n for n in range(len(parts), 0, -1) if module_exists(".".join(parts[:n])))
-    return reduce(getattr, parts[known:], import_module(".".join(parts[:known])))
-
-
-def module_exists(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False
-
-
 def test_the_page_has_every_part_of_the_paper() -> None:
     first = " ".join(row[0] for row in ROWS)
     for part in (*(f"Algorithm {n}" for n in range(1, 7)), *(f"Eq. {n}" for n in range(1, 7))):
@@ -53,18 +36,16 @@ def test_the_page_has_every_part_of_the_paper() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_the_page_names_exists(name: str) -> None:
-    assert find(name) is not None
+    path = name if name.startswith("ucfrec") else f"ucfrec.{name}"
+    assert resolve_name(path) is not None
 
 
 @pytest.mark.parametrize("row", SETTINGS, ids=lambda row: row[0])
 def test_the_preset_has_the_printed_value(row: list[str]) -> None:
     key, printed, *values, reason = row
     table, field = key.strip("`").split(".")
-    configs: list[Config] = []
-    for task, kind in TASKS:
-        configs.append(
-            resolve_config("ucf-paper", presets=find_preset(task, kind, "ucf-paper").tables)
-        )
+    tables = [find_preset(task, kind, "ucf-paper").tables for task, kind in TASKS]
+    configs = [resolve_config("ucf-paper", presets=each) for each in tables]
     actual = [getattr(getattr(config, table), field) for config in configs]
     stated = [parse(value) for value in values]
     assert actual == stated

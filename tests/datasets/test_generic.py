@@ -2,24 +2,16 @@
 
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import random_log
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import FeatureTable, LogMapping, read_mapping
 from ucfrec.logs.prepare import validate
 from ucfrec_datasets import generic
 
-START = 1_700_000_000_000
-
-
-def make_log(rows: int = 40) -> pd.DataFrame:
-    row = np.arange(rows)
-    columns = {"user_id": row % 7, "item_id": row % 5, "timestamp": START + row, "reward": row % 3}
-    return pd.DataFrame(columns)
-
-
+LOG = random_log(40, users=7, items=5)
 ITEMS = pd.DataFrame({"item_id": range(5), "price": range(5)})
 
 
@@ -31,8 +23,8 @@ def test_folders_called_like_tables_are_tables(tmp_path: Path, given: str) -> No
         file.parent.mkdir(exist_ok=True)
         (file.parent / "_SUCCESS").touch()
         (file.parent / f".{file.name}").touch()
-    make_log().iloc[:20].to_parquet(parts[0])
-    make_log().iloc[20:].to_parquet(parts[1])
+    LOG.iloc[:20].to_parquet(parts[0])
+    LOG.iloc[20:].to_parquet(parts[1])
     ITEMS.to_parquet(items)
     paths = [tmp_path / path for path in given.split()]
     files, mapping = generic.DATASET.resolve(paths, LogMapping())
@@ -42,7 +34,7 @@ def test_folders_called_like_tables_are_tables(tmp_path: Path, given: str) -> No
 
 
 def test_feature_tables_of_the_mapping_are_no_log(tmp_path: Path) -> None:
-    make_log().to_parquet(tmp_path / "log.parquet")
+    LOG.to_parquet(tmp_path / "log.parquet")
     ITEMS.to_parquet(tmp_path / "videos.parquet")
     (tmp_path / "m.toml").write_text(
         f'[[item_features]]\nfiles = ["../{tmp_path.name}/videos.parquet"]\nkey = "item_id"\n'
@@ -57,6 +49,6 @@ def test_feature_tables_of_the_mapping_are_no_log(tmp_path: Path) -> None:
 
 
 def test_a_log_called_like_features_is_told_of(tmp_path: Path) -> None:
-    make_log().to_parquet(tmp_path / "users.parquet")
+    LOG.to_parquet(tmp_path / "users.parquet")
     with pytest.raises(InputError, match=r"users.parquet: every file is called .* rename it"):
         generic.DATASET.resolve([tmp_path], LogMapping())

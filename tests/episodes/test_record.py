@@ -68,3 +68,15 @@ def test_what_cannot_be_is_named(store: Path, name: str, value: object) -> None:
     with pytest.raises(InputError, match=rf"meta\.json is damaged: its {name}") as caught:
         EpisodeStore.open(store)
     assert "prepare it again" in str(caught.value)
+
+
+def test_a_changed_a_newer_and_no_record_are_named(store: Path) -> None:
+    path = store / "meta.json"
+    changed = path.read_text().replace("log.parquet", "x.parquet")
+    for content, says in ((changed, "was changed after"), ('{"version": 99}', "upgrade ucfrec")):
+        path.write_text(content)
+        with pytest.raises(InputError, match=says):
+            EpisodeStore.open(store)
+    path.unlink()
+    with pytest.raises(InputError, match=r"not an episode store.*meta\.json"):
+        EpisodeStore.open(store)

@@ -153,26 +153,6 @@ def test_columns_are_mapped_when_they_are_used(tmp_path: Path) -> None:
     assert EpisodeStore.open(store.path).record.n_steps == sum(LENGTHS)
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda text: '{"version": 99}', "upgrade ucfrec"),
-        (lambda text: text.replace('"reward": "reward"', '"reward": "x"'), "was changed after"),
-        (lambda text: None, r"not an episode store.*meta\.json"),
-    ],
-)
-def test_a_damaged_record_is_named(
-    tmp_path: Path, damage: Callable[[str], str | None], message: str
-) -> None:
-    path = write_store(tmp_path / "store", random_episodes(LENGTHS)).path / "meta.json"
-    content = damage(path.read_text())
-    path.unlink()
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(InputError, match=message):
-        EpisodeStore.open(path.parent)
-
-
 def use(store: EpisodeStore) -> None:
     store.episode_values(schema.USER)
     all_windows(store, 3)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensorboardX.proto.event_pb2 import Event
 
+from tests.support.records import JSON
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import METRICS, MetricsLog, read_metrics
 
@@ -66,11 +67,6 @@ def test_other_lines_are_named_in_one_line(tmp_path: Path, line: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
-    max_leaves=5,
-)
 ROWS = st.dictionaries(st.sampled_from(["step", "loss", "kl"]), JSON)
 LINES = st.binary(max_size=30) | (JSON | ROWS).map(lambda value: json.dumps(value).encode())
 

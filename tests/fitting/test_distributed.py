@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import nn
 
+from tests.fitting.test_loop import Model
 from tests.support.together import together
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
@@ -16,24 +16,18 @@ ROWS = torch.tensor([3, 7, 7, 0, 9])
 """The first two are of the first process, the others of the second."""
 
 
-class Table(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.table, self.line = nn.Parameter(torch.randn(10, 3)), nn.Linear(3, 1)
-        self.unused = nn.Parameter(torch.ones(2))
-
-    def forward(self, rows: Tensor) -> Tensor:
-        vectors = F.embedding(rows, self.table, sparse=True)
-        return self.line(vectors).square().mean()  # type: ignore[no-any-return]
+def make_model() -> Model:
+    model = Model(sparse=True)
+    model.unused = nn.Parameter(torch.ones(2))
+    return model
 
 
 def test_gradients_and_means_are_those_of_all_rows(tmp_path: Path) -> None:
-    whole, values = Table(), torch.randn(7)
+    whole, values = make_model(), torch.randn(7)
     whole(ROWS).backward()
 
     def work() -> None:
-        model, own = Table(), ROWS[:2] if distributed.leads() else ROWS[2:]
+        model, own = make_model(), ROWS[:2] if distributed.leads() else ROWS[2:]
         model(own).backward()
         distributed.average_gradients(model.parameters(), len(own))
         found, expected = (

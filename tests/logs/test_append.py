@@ -22,18 +22,7 @@ from ucfrec.logs.append import AppendOptions, append_logs, find_end
 
 def rows_of(path: Path) -> list[tuple[int | str, int | str, int, float]]:
     """All rows of a store, with the identifiers of its users and items, sorted."""
-    store = EpisodeStore.open(path)
-    users, items = (
-        pq.read_table(path / f"{name}.parquet")[f"{name[:-1]}_id"].to_numpy()
-        for name in ("users", "items")
-    )
-    episodes, steps = store.all_steps()
-    columns = (
-        users[store.episode_values(schema.USER).astype(int)[episodes]],
-        items[store.step_values(schema.ITEM, episodes, steps)],
-        *(store.step_values(name, episodes, steps) for name in (schema.TIMESTAMP, schema.REWARD)),
-    )
-    return sorted(zip(*(column.tolist() for column in columns), strict=True))
+    return rows_in(EpisodeStore.open(path).to_frame())
 
 
 def rows_in(*logs: pd.DataFrame) -> list[tuple[int | str, int | str, int, float]]:

@@ -61,11 +61,7 @@ def steps_of(out: Path) -> pd.DataFrame:
     columns |= {n: store.episode_values(n)[episodes] for n in schema.EPISODE_DTYPES}
     names = {*store.record.columns} - {schema.ACTION, schema.OBSERVATION}
     columns |= {name: store.step_values(name, episodes, steps) for name in names}
-    frame = pd.DataFrame(columns)
-    for name in ("user", "item"):
-        ids = pq.read_table(out / f"{name}s.parquet")[f"{name}_id"].to_numpy()
-        frame[f"{name}_id"] = ids[frame[name]]
-    return frame
+    return pd.DataFrame(columns).join(store.to_frame()[["user_id", "item_id"]])
 
 
 def expected_sessions(log: pd.DataFrame, gap_minutes: float) -> pd.DataFrame:

@@ -136,14 +136,10 @@ def test_the_fingerprint_covers_every_feature_value(tmp_path: Path, name: str, v
 # Identifiers
 
 
-@pytest.mark.parametrize(
-    ("late", "rows"),
-    [(late, 40) for late in ("007", "1e1", "1_0", "0x1f", "7 ", '"7"')] + [("007", 21_000)],
-)
-def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows: int) -> None:
+def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path) -> None:
     """Also where DuckDB, which looks at the first rows, takes the column for whole numbers."""
-    ids = [*map(str, np.arange(rows) % 49 + 1)]
-    ids[-1] = late
+    ids = [*map(str, np.arange(21_000) % 49 + 1)]
+    ids[-2:] = ["007", '"7"']
     lines = [f"{n % 10},{each},{START + 1000 * n},{n % 2}" for n, each in enumerate(ids)]
     for name in ("user_id,item_id", "item_id,user_id"):
         path = tmp_path / "log.csv"

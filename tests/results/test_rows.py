@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.records import JSON
 from tests.support.result_rows import result_row
 from ucfrec.errors import InputError
 from ucfrec.results.rows import (
@@ -74,15 +75,8 @@ def test_what_is_of_another_kind_is_refused(change: dict[str, Any], says: str) -
     assert "\n" not in str(refused.value)
 
 
-_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner),
-    max_leaves=4,
-)
-
-
 @settings(max_examples=40)
-@given(name=st.sampled_from([*WHOLE.to_json(), "other"]), value=_JSON)
+@given(name=st.sampled_from([*WHOLE.to_json(), "other"]), value=JSON)
 def test_whatever_stands_in_a_field_it_is_a_row_or_refused(name: str, value: Any) -> None:
     with pytest.raises(InputError, match="here is not a result row"):
         row_from_json(json.dumps(value), "here")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ucfrec.results.statistics import group_auc, grouped, summary
+from ucfrec.results.statistics import grouped, summary
 
 
 def test_the_spread_is_that_of_a_sample() -> None:
@@ -21,17 +21,3 @@ def test_the_spread_is_that_of_a_sample() -> None:
 def test_groups_keep_the_order_in_which_they_come() -> None:
     groups = list(grouped("bAaBc", str.lower).items())
     assert groups == [("b", ["b", "B"]), ("a", ["A", "a"]), ("c", ["c"])]
-
-
-def test_group_auc_is_the_mean_over_pairs_of_a_user() -> None:
-    rng = np.random.default_rng(0)
-    owner = rng.integers(6, size=60)
-    scores, liked = rng.integers(5, size=60).astype(float), rng.random(60) < 0.4
-    liked[owner == 2] = True
-    above, below = group_auc(scores, liked, owner, 7)
-    for user in range(7):
-        good, bad = scores[(owner == user) & liked], scores[(owner == user) & ~liked]
-        pairs = [(a > b) + 0.5 * (a == b) for a in good for b in bad]
-        size = (owner == user).sum() if pairs else 0
-        assert below[user] == size
-        assert above[user] == pytest.approx(size * np.mean(pairs) if pairs else 0.0)

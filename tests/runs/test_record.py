@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.recommending.test_recommend import SMALL
 from tests.support.random_runs import random_run
-from tests.support.records import DAMAGE, damaged, paths
+from tests.support.records import DAMAGE, JSON, damaged, paths
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -20,11 +20,6 @@ from ucfrec.runs.record import RunRecord, read_record
 
 OPTIONAL = {"reference_losses", "augmentation", "policy", "reward_model", "rule"}
 """Entries of stages that may not have ended."""
-anything = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
-    max_leaves=5,
-)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +101,7 @@ def test_every_command_says_what_is_wrong(
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(data=st.data(), value=anything)
+@given(data=st.data(), value=JSON)
 def test_no_value_gives_another_error(folder: Path, data: st.DataObject, value: object) -> None:
     record = record_of(folder)
     path = data.draw(st.sampled_from(list(paths(record))))

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+from hypothesis import strategies as st
+
 from ucfrec.files.record import Record, Undefinable
 
 
@@ -19,6 +21,12 @@ class Example(Record):
     needed: str | None = "x"
 
 
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=5,
+)
+"""What may stand in JSON, and more that Python reads."""
 MISSING = object()
 DAMAGE: dict[str, Any] = {
     "missing": MISSING,

@@ -109,9 +109,7 @@ class Ends:
             if statuses[0] or (self.job.second == "refused" and statuses[1] != 2):
                 self._count(counts, f"ends {statuses}")
             refused = next((end.printed for end in ends if end.status == 2), "")
-            said = any(
-                words in refused for words in ("is being", "exists already", "cannot listen")
-            )
+            said = any(words in refused for words in _REFUSED)
             self._count(counts, "" if said or not refused else f"says {refused[:80]}")
             counts["refused"] += bool(refused)
             self._compare(counts, out)

@@ -166,11 +166,7 @@ class Inputs:
 
 
 def digest_output(path: Path) -> str:
-    """A digest of an output, without times and names of folders.
-
-    Raises:
-        Exception: a file is not whole.
-    """
+    """A digest of an output, without times and names of folders; raises if a file is not whole."""
     from ucfrec.files.atomic import LOCK, SCRATCH
 
     contents = {b"": _content(path)} if path.is_file() else dict[bytes, bytes]()

@@ -85,9 +85,10 @@ def test_a_run_is_level_with_itself(trained: TrainedPolicy) -> None:
     assert all(each.value == 0 for each in found.differences.values())
 
 
-def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
-    """The test rows with other propensities, or none."""
-    store = rows_of_test(trained)
+def rows_of(
+    trained: TrainedPolicy, store: EpisodeStore, propensities: Array | None
+) -> EpisodeStore:
+    """The rows with other propensities, or none."""
     steps = {name: store.column(name) for name in ("item", "reward", "timestamp")}
     if propensities is not None:
         steps["propensity"] = propensities
@@ -96,7 +97,8 @@ def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
 
 
 def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
-    found = compare_runs(trained, reversed_of(trained), newest(rows_of(trained, None)), 0)
+    blind = rows_of(trained, rows_of_test(trained), None)
+    found = compare_runs(trained, reversed_of(trained), newest(blind), 0)
     assert (found.result, found.decided_by) == ("better", "ndcg_liked")
     assert len(found.differences) == 1
 
@@ -110,16 +112,14 @@ def test_clicks_on_what_the_old_run_showed_do_not_speak_for_it(
     rows = logged(tmp_path, items, shares[items], (0.1, 0.1, 0.8)).split("test")
     found = compare_runs(trained, reversed_of(trained), newest(rows), 0).differences
     assert found["ndcg_liked"].standing() == "better"
-    steps = {name: rows.column(name) for name in ("item", "reward", "timestamp")}
-    episodes = {n: rows.episode_values(n) for n in ("user", "terminated")}
-    blind = EpisodeStore.from_arrays(steps, rows.lengths, episodes, trained.item_states)
+    blind = rows_of(trained, rows, None)
     found = compare_runs(trained, reversed_of(trained), newest(blind), 0).differences
     assert found["ndcg_liked"].standing() == "worse"
 
 
 def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
-    steps = rows_of_test(trained).n_steps
-    wrong = rows_of(trained, np.full(steps, 5 / LOGGED_ITEMS, dtype=np.float32))
+    rows = rows_of_test(trained)
+    wrong = rows_of(trained, rows, np.full(rows.n_steps, 5 / LOGGED_ITEMS, dtype=np.float32))
     found = compare_runs(trained, trained, newest(wrong), 0)
     assert (found.result, found.decided_by) == ("open", "reward per step")
     assert "where 1 is expected" in found.differences["reward per step"].reasons[0]

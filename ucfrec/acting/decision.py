@@ -40,10 +40,7 @@ class DecisionRule:
 
     With a lookahead V, f̂_r is instead r̂ + (1 − p_end) · V, in units of the range of rewards: what
     showing the item is expected to be rewarded with, and what follows if the session goes on.
-    Policies with vector actions use the target alone.
-
-    Raises:
-        InputError: a value is out of range.
+    Policies with vector actions use the target alone. InputError if a value is out of range.
     """
 
     target: _Return
@@ -89,11 +86,8 @@ class DecisionRule:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], source: str) -> Self:
-        """Rebuild a rule from its `as_dict`; messages name the `source`.
-
-        Raises:
-            InputError: a field is unknown, missing, of another type or out of range.
-        """
+        """Rebuild a rule from its `as_dict`; messages name the `source`. InputError if a field is
+        unknown, missing, of another type or out of range."""
         try:
             return cls(**values)
         except (InputError, TypeError) as error:

@@ -89,11 +89,8 @@ class PolicyActor:
 
     def inform(self, info: Mapping[str, Any]) -> None:
         """Record the users of the next step (`USER_IDS`), its forbidden items (`FORBIDDEN`) and
-        what is on offer (`OFFER`).
-
-        Raises:
-            InputError: items are forbidden, but the policy's actions are vectors.
-        """
+        what is on offer (`OFFER`). InputError if items are forbidden, but the policy's actions are
+        vectors."""
         users, lookup, ids = info.get(USER_IDS), self._user_ids, self._item_ids
         if users is not None and lookup is not None:
             numbers = torch.from_numpy(lookup.numbers(users))

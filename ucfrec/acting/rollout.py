@@ -56,10 +56,7 @@ class Memoryless:
 
 class Uniform(Memoryless):
     """Uniformly random actions: vectors in a box, or items of a catalogue with their propensity.
-
-    Raises:
-        InputError: the actions are vectors without finite bounds.
-    """
+    InputError if the actions are vectors without finite bounds."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         self._space = env.single_action_space

@@ -112,11 +112,8 @@ class Scorer:
         self._require_parts()
 
     def under(self, rule: DecisionRule) -> "Scorer":
-        """The same policy under another rule; what is computed once is shared.
-
-        Raises:
-            InputError: the rule needs what the run lacks.
-        """
+        """The same policy under another rule; what is computed once is shared. InputError if the
+        rule needs what the run lacks."""
         scorer = copy.copy(self)
         scorer.rule, scorer.engine = rule, None
         scorer._require_parts()
@@ -263,16 +260,13 @@ class Scorer:
         empty: bool = False,
     ) -> Tensor:
         """(B, n_items) log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row; −∞ for items left
-        out.
+        out. InputError if no item is left in some row, or the scores of some row are NaN.
 
         Args:
             sessions: of at least `reach` items with their states, or of `length` items.
             left_out: rows (N,) and items (N,) of what may not be shown.
             excluded: (B, n_items) or (n_items,) bool, what may not be shown.
             empty: whether all items of a row may be excluded.
-
-        Raises:
-            InputError: no item is left in some row, or the scores of some row are NaN.
         """
         exporting = torch.compiler.is_exporting()
         serving = sessions.states is None and self.is_product and not exporting
@@ -648,12 +642,8 @@ def logged_scores(
 
 
 def _require_scores(scores: Tensor, empty: bool) -> Tensor:
-    """Scores (B, n_items), checked.
-
-    Raises:
-        InputError: those of some row are NaN, or infinitely high, or unless `empty` no item is
-            left in it.
-    """
+    """Scores (B, n_items), checked. InputError if those of some row are NaN, or infinitely high, or
+    unless `empty` no item is left in it."""
     highest = scores.amax(1)
     undefined = ~(highest < torch.inf)
     if undefined.any():

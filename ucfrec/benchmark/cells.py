@@ -130,9 +130,9 @@ class Budget:
         values = dict(setting.split("=", 1) for setting in self.settings)
         steps = min(int(values.get("train.steps", preset.steps)), preset.steps)
         warmup = preset.warmup * steps // preset.steps
-        names = ("train.validate_every=", "train.precision=")
-        same = tuple(s for s in self.settings if s.startswith(names))
-        return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *same, *method.settings)
+        prefixes = ("train.validate_every=", "train.precision=")
+        settings = tuple(s for s in self.settings if s.startswith(prefixes))
+        return (f"train.steps={steps}", f"train.warmup_steps={warmup}", *settings, *method.settings)
 
     def narrow(
         self,

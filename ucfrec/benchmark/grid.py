@@ -27,7 +27,8 @@ def run_grid(
 
     The rows of a cell are appended as soon as it is measured, so an interruption loses none. A cell
     that fails does not stop the others and is reported at the end. One worker, or an only cell, is
-    measured in this process.
+    measured in this process. InputError if a line of `results` is not a result row, or at least one
+    cell failed.
 
     Args:
         results: file of result rows (JSON lines), which no other process may fill
@@ -35,9 +36,6 @@ def run_grid(
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
         again: remove the rows, runs and shared stages of `cells` first.
-
-    Raises:
-        InputError: a line of `results` is not a result row, or at least one cell failed.
     """
     tasks: dict[str, tuple[RowKey, Cell]] = {}
     for cell in cells:
@@ -127,10 +125,7 @@ def _measure_all(
 
 def select_names(names: Iterable[str], selected: Sequence[str], what: str) -> list[str]:
     """Those of `names`, which stand for `what`, that are in `selected`; all if it is empty.
-
-    Raises:
-        InputError: `selected` has a name that `names` lacks.
-    """
+    InputError if `selected` has a name that `names` lacks."""
     choices = list(names)
     if unknown := [name for name in selected if name not in choices]:
         raise InputError(

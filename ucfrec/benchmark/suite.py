@@ -88,12 +88,9 @@ class BenchmarkRequest:
 
 
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
-    """The tables; measures their cells that have no row yet.
-
-    Raises:
-        InputError: the budget, a task or a method is unknown, another table than main is requested
-            of a single environment, or cells failed.
-    """
+    """The tables; measures their cells that have no row yet. InputError if the budget, a task or a
+    method is unknown, another table than main is requested of a single environment, or cells
+    failed."""
     select_names(suite.budgets, [request.budget], "budget")
     select_names(suite.tasks, request.tasks, "task")
     select_names(suite.methods, request.methods, "method")

@@ -84,11 +84,7 @@ class Table:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def execute(self) -> None:
-        """Run the command.
-
-        Raises:
-            InputError: what the command line names cannot be used.
-        """
+        """Run the command. InputError if what the command line names cannot be used."""
         raise NotImplementedError
 
 
@@ -104,7 +100,7 @@ def add_options(
     """Add the options of a command to its parser, in groups, with the help that is asked for: all,
     or what fits one screen, with options of titled groups by name only, and of the others what
     comes before a semicolon."""
-    shown = any(word.startswith(("-h", "--h")) for word in arguments)
+    asks_help = any(word.startswith(("-h", "--h")) for word in arguments)
     everything = any(word.startswith("--help-") for word in arguments)
     text = "show this help message and exit" if everything else argparse.SUPPRESS
     parser.add_argument("-h", "--help", action="help", help=text)
@@ -125,7 +121,7 @@ def add_options(
         name = f"--{field.name.replace('_', '-')}"
         if ARGUMENT in marks:
             name, group = field.name, parser
-        text = _describe(owner, field, marks).replace("%", "%%") if shown else ""
+        text = _describe(owner, field, marks).replace("%", "%%") if asks_help else ""
         if not everything:
             text = text.partition(";")[0]
             if title and group is not parser:

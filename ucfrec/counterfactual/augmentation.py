@@ -147,10 +147,7 @@ class AugmentationReport:
 
 def require_rewards_vary(train: EpisodeStore) -> None:
     """Check that the training rewards are not all equal, which a reward model cannot learn from.
-
-    Raises:
-        InputError: all training rewards are equal.
-    """
+    InputError if all training rewards are equal."""
     rewards = train.column_batches(schema.REWARD)
     values = np.unique([extreme for (part,) in rewards for extreme in (part.min(), part.max())])
     if len(values) == 1:

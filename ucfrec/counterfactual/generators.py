@@ -291,8 +291,8 @@ def _fit_faithful(
     low, high = config.band
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, ...]:
-        drawn = generator.integers(len(rows), size=config.batch_size)
-        at = torch.from_numpy(drawn).to(crm.device)
+        numbers = generator.integers(len(rows), size=config.batch_size)
+        at = torch.from_numpy(numbers).to(crm.device)
         return tuple(values[at] for values in logged)
 
     def loss(batch: tuple[Tensor, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:

@@ -360,8 +360,8 @@ def _fit(
     inputs, target = rows
 
     def draw(generator: np.random.Generator) -> _Rows:
-        drawn = generator.integers(len(target), size=loop.batch_size)
-        at = torch.from_numpy(drawn).to(target.device)
+        numbers = generator.integers(len(target), size=loop.batch_size)
+        at = torch.from_numpy(numbers).to(target.device)
         return inputs[at], target[at], _draw_noise(generator, target[at], noise)
 
     def validate() -> float:

@@ -1,16 +1,12 @@
 """Items without torch, which preparing a log does not need: numbers, and the file of states."""
 
-import json
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import save_file
 
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import save_arrays
 
 ITEM_STATES = "item_states.safetensors"
 """Name of the file in a store or a run."""
@@ -39,28 +35,14 @@ def write_item_table(
     decay: float = DECAY,
 ) -> None:
     """Write the file of `ucfrec.episodes.states.ItemStates`, atomically; arguments are its fields,
-    with None for no tags.
-
-    Raises:
-        InputError: the disk is full, or the folder is not writable.
-    """
+    with None for no tags. InputError if the disk is full."""
     numbers = {"window": window, "decay": decay}
     numbers |= {"reward_low": reward_low, "reward_high": reward_high}
     arrays: dict[str, Array] = {"embeddings": embeddings, "user_features": user_features}
     if tags is not None and tags.shape[1]:
         arrays["tags"] = tags
     plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    with atomic_file(path) as scratch:
-        scratch.touch()
-        mode = scratch.stat().st_mode
-        try:
-            save_file(plain, scratch, metadata={"about": json.dumps(numbers)})
-            # safetensors restricts its files to their owner; give them the usual permissions.
-            scratch.chmod(mode)
-        except SafetensorError as error:
-            raise InputError(
-                f"{path} cannot be written ({error}); free disk space and run the command again"
-            ) from None
+    save_arrays(path, plain, numbers)
 
 
 class IdLookup:

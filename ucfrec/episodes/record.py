@@ -112,25 +112,23 @@ class StoreRecord(Record):
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read and check the record of a store.
-
-        Raises:
-            InputError: the folder is not a store, its record is damaged, or a newer ucfrec wrote
-                it.
-        """
+        """Read and check the record of a store. InputError if the folder is not a store, its record
+        is damaged, or a newer ucfrec wrote it."""
         record = super().read(folder)
         names = (folder / f"shard-{n:05d}" for n in range(record.n_shards))
         shards = list(takewhile(Path.is_dir, names))
-        if not 1 <= len(shards) == record.n_shards <= record.n_episodes:
-            raise record._bad(folder, "n_shards", record.n_shards)
         # Before memory for an entry per step is allocated: the files can hold the steps.
         files = [file for s in shards if (file := s / f"{schema.REWARD}.npy").is_file()]
         size = np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
         held = sum(file.stat().st_size for file in files) // size
-        if len(files) == record.n_shards and record.n_steps > held:
-            raise record._bad(folder, "n_steps", record.n_steps)
-        if record.n_episodes > record.n_steps:
-            raise record._bad(folder, "n_episodes", record.n_episodes)
+        faults = {
+            "n_shards": not 1 <= len(shards) == record.n_shards <= record.n_episodes,
+            "n_steps": len(files) == record.n_shards and record.n_steps > held,
+            "n_episodes": record.n_episodes > record.n_steps,
+        }
+        for name in (name for name, holds in faults.items() if holds):
+            what = f"{folder / cls.FILE} is damaged: its {name} is {getattr(record, name)}"
+            raise InputError(f"{what}; {cls.REMEDY}")
         return record
 
     @classmethod
@@ -143,12 +141,3 @@ class StoreRecord(Record):
                 f"{schema.STORE_VERSION}; upgrade ucfrec"
             )
         return super().of(value, path)
-
-    def _bad(
-        self,
-        folder: Path,
-        name: str,
-        value: int,
-    ) -> InputError:
-        path = folder / self.FILE
-        return InputError(f"{path} is damaged: its {name} is {value}; {self.REMEDY}")

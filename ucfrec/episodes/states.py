@@ -39,10 +39,7 @@ class ItemStates:
     A state of size S = 3D + 2 + F + O holds, in this order: the recency-weighted mean embedding of
     the last `window` items shown (D), the same weighted by reward as well (D), the last item's
     embedding (D), the last reward scaled to [0, 1] (1), log(1 + step) (1), user features (F) and
-    the logged observation (O).
-
-    Raises:
-        InputError: `reward_low` is not below `reward_high`.
+    the logged observation (O). InputError if `reward_low` is not below `reward_high`.
     """
 
     embeddings: Tensor

@@ -48,10 +48,7 @@ class EpisodeStore(EpisodeView):
     @classmethod
     def open(cls, path: str | Path) -> "EpisodeStore":
         """Open a store folder; only `meta.json` is read, columns are memory-mapped on first use.
-
-        Raises:
-            InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
-        """
+        InputError if the folder is not a store, is damaged, or was written by a newer ucfrec."""
         path = Path(path)
         return cls(Columns(path, StoreRecord.read(path)))
 
@@ -134,11 +131,8 @@ class EpisodeStore(EpisodeView):
     def to_frame(self) -> "pd.DataFrame":
         """One row per step, session by session: `user_id`, `session_id` (the number of the session
         in the store; one for all episodes of a session that a split boundary cuts), `item_id` or
-        `action`, the other columns of the log that the store has, and `split`.
-
-        Raises:
-            InputError: a file of the store is damaged.
-        """
+        `action`, the other columns of the log that the store has, and `split`. InputError if a file
+        of the store is damaged."""
         import pandas as pd  # most stores are never shown
 
         episodes, steps = self.all_steps()
@@ -186,11 +180,8 @@ class EpisodeStore(EpisodeView):
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
-        """A view of the episodes in one split, which may be empty.
-
-        Raises:
-            InputError: `name` is not "train", "validation" or "test".
-        """
+        """A view of the episodes in one split, which may be empty. InputError if `name` is not
+        "train", "validation" or "test"."""
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
         in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)

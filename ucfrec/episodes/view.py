@@ -300,11 +300,8 @@ class EpisodeView:
 
     @cached_property
     def item_states(self) -> ItemStates:
-        """Builds states from items; for stores of items only.
-
-        Raises:
-            InputError: the file of item states is missing or damaged.
-        """
+        """Builds states from items; for stores of items only. InputError if the file of item states
+        is missing or damaged."""
         return self._columns.item_states
 
     @property
@@ -313,11 +310,8 @@ class EpisodeView:
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
     def episode_values(self, name: str) -> Array:
-        """An episode column, (E,).
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """An episode column, (E,). InputError if the store has no such column, or its files are
+        damaged."""
         return self._columns.episode_column(name)[self.episode_ids]
 
     @property
@@ -340,11 +334,8 @@ class EpisodeView:
         steps: IntArray,
     ) -> Array:
         """Values of a step column at steps (from 0) of episodes, two arrays whose shapes broadcast;
-        of this shape, followed by the size of a vector.
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        of this shape, followed by the size of a vector. InputError if the store has no such column,
+        or its files are damaged."""
         index = self._columns.starts[self.episode_ids[episodes]] + steps
         return self._columns.step_column(name).take(index)
 
@@ -470,6 +461,7 @@ class EpisodeView:
 
         Of a decision with several rows, the rows before that step are left out: the last column is
         the decision, with the step's own action and reward, after the steps before the decision.
+        InputError if an episode or step does not exist, or the arguments have other shapes.
 
         Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
         [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
@@ -478,9 +470,6 @@ class EpisodeView:
             episodes: (B,) positions in the view.
             ends: (B,) last step of each window, from 0.
             length: K, at least 1; shorter episodes are padded on the left.
-
-        Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
         """
         self._require_steps(episodes, ends, length)
         starts = self.decision_starts(episodes, ends)

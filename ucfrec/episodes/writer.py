@@ -181,10 +181,8 @@ def reward_bit(
     A reward is high if it exceeds the median of all rewards; if the median equals the largest
     reward (more than half of all steps are clicks), a reward is high if it equals the median. The
     paper's deterministic distractor has `flip` 0, the stochastic one 0.15. An `early` bit is that
-    of the next step, d_t = I{r_{t+1} is high}, but for the last step of an episode.
-
-    Raises:
-        InputError: `flip` is not a probability, or all rewards are equal.
+    of the next step, d_t = I{r_{t+1} is high}, but for the last step of an episode. InputError if
+    `flip` is not a probability, or all rewards are equal.
     """
     if not 0 <= flip <= 1:
         raise InputError(f"flip, the probability of a wrong bit, is {flip}; it must be in [0, 1]")

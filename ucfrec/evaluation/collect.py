@@ -47,9 +47,7 @@ def collect(
     sessions simulated in parallel are interleaved), `items.parquet` if the environment describes
     its items, and `collect.json`, the record of the run. Sessions start 60 s apart and their steps
     1 s apart. `env` is made by `simulator`, and its environment i seeded with `seed` + i.
-
-    Raises:
-        InputError: `sessions` is below 1, or `out` exists.
+    InputError if `sessions` is below 1, or `out` exists.
     """
     if sessions < 1:
         raise InputError(f"sessions is {sessions}; give 1 or more")

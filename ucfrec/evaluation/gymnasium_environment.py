@@ -43,11 +43,8 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     Of `info`, the environment passes on `user_id`, a whole number. One that `reset` gives is that
     of the whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a
-    number drawn from (s, i), so that two seeds share no sessions.
-
-    Raises:
-        InputError: it cannot be made or played, or lacks the entries `observe`; or later, if it
-            gives only some sessions a `user_id`.
+    number drawn from (s, i), so that two seeds share no sessions. InputError if it cannot be made
+    or played, or lacks the entries `observe`; or later, if it gives only some sessions a `user_id`.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import FrameTable
-from ucfrec.results.statistics import group_auc, resampled_ratios
+from ucfrec.results.statistics import group_auc, resample_ratios
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
@@ -281,7 +281,7 @@ def compare(
     # (U, rankers, measures), so that one draw of users serves all rankers.
     above, below = np.ascontiguousarray(np.transpose(measured, (2, 3, 0, 1)))
     users = len(above)
-    ratios = resampled_ratios(above.reshape(users, -1), below.reshape(users, -1), seed)
+    ratios = resample_ratios(above.reshape(users, -1), below.reshape(users, -1), seed)
     resampled = ratios.reshape((-1, *above.shape[1:]))
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)

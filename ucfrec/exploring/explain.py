@@ -66,15 +66,13 @@ def explain(
     time_ms: int | None = None,
     seed: int = 0,
 ) -> Explained:
-    """The recommendations of `ucfrec recommend` for one user, with their reasons.
+    """The recommendations of `ucfrec recommend` for one user, with their reasons. InputError if the
+    rule does not fit the policy, or an item is not known.
 
     Args:
         candidates: the only items to recommend; None for all.
         time_ms: the moment of the decision, before which rows count; None for right after the last.
         seed: of the draws of a rule that draws.
-
-    Raises:
-        InputError: the rule does not fit the policy, or an item is not known.
     """
     gap, new = trained.record.session_gap_ms, False
     at = time_ms
@@ -125,11 +123,8 @@ def _cut_history(user: Histories, time_ms: int) -> Histories:
 
 def read_pasted(text: str) -> pd.DataFrame:
     """The history that someone pasted: a row per line, `item_id` or `item_id, reward`, the latest
-    last, as a frame of one user whose rows are a minute apart.
-
-    Raises:
-        InputError: a reward is not a number.
-    """
+    last, as a frame of one user whose rows are a minute apart. InputError if a reward is not a
+    number."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     parts = [line.rpartition(",") for line in lines]
     items = [item.strip() if comma else line for item, comma, line in parts]

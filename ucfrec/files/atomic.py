@@ -40,10 +40,7 @@ _held: set[tuple[int, Path]] = set()
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a scratch folder next to `path` that is renamed to `path` when the block succeeds.
-
-    Raises:
-        InputError: `path` exists already, or another process is writing it.
-    """
+    InputError if `path` exists already, or another process is writing it."""
     with lock_path(path):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already; remove it or name another output folder")
@@ -132,12 +129,8 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
 
 @contextmanager
 def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
-    """Hold the claim on `path`, or on this `part` of its use only.
-
-    Raises:
-        InputError: another process holds it; the message names that process, and the `use` that it
-            makes of the path.
-    """
+    """Hold the claim on `path`, or on this `part` of its use only. InputError if another process
+    holds it; the message names that process, and the `use` that it makes of the path."""
     part_path = path.with_name(f"{path.name}.{part}") if part else path
     with claim(part_path) as held:
         if held:
@@ -223,12 +216,30 @@ def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = Fa
         scratch.write_text(json_text(value, indent=2) + "\n", encoding="utf-8")
 
 
+def save_arrays(path: Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
+    """Write named arrays, contiguous, and metadata that JSON can represent as safetensors,
+    atomically; InputError if there is no space."""
+    from safetensors import SafetensorError  # imports NumPy
+    from safetensors.numpy import save_file
+
+    with atomic_file(path) as scratch:
+        scratch.touch()
+        mode = scratch.stat().st_mode
+        try:
+            # One entry: safetensors writes several in any order, and files of equal content are to
+            # be equal.
+            save_file(dict(arrays), scratch, metadata={"about": json.dumps(metadata)})
+        except SafetensorError as error:
+            raise InputError(
+                f"{path} cannot be written ({error}); free disk space and run the command again"
+            ) from None
+        # safetensors restricts its files to their owner; give them the usual permissions.
+        scratch.chmod(mode)
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file; the entry `checksum` of a sealed object is verified and excluded.
-
-    Raises:
-        InputError: the file is missing, is not JSON, or was changed after it was sealed.
-    """
+    InputError if the file is missing, is not JSON, or was changed after it was sealed."""
     value = _parse(path, _LARGEST_JSON, "JSON", json.loads)
     if isinstance(value, dict) and isinstance(value.get(_CHECKSUM), str):
         stated = value.pop(_CHECKSUM)

@@ -156,10 +156,7 @@ class Record(Entry):
         small: int = -1,
     ) -> None:
         """Check size and content of `names` that are listed; without any, sizes, and small files.
-
-        Raises:
-            InputError: the first file that is missing or has another content.
-        """
+        An InputError names the first file that is missing or has another content."""
         for name in names or self.files:
             if name not in self.files:
                 continue

@@ -54,12 +54,8 @@ def uri_or_path(
 
 @contextmanager
 def local_paths(options: argparse.Namespace) -> Iterator[argparse.Namespace]:
-    """The same options with local paths in place of URIs.
-
-    Raises:
-        InputError: an input cannot be read or has no place on the disk, an output cannot be
-            written, or a store exists already.
-    """
+    """The same options with local paths in place of URIs. InputError if an input cannot be read or
+    has no place on the disk, an output cannot be written, or a store exists already."""
     values = vars(options)
     lists = [value if isinstance(value, list) else [value] for value in values.values()]
     uris = [uri for arguments in lists for uri in arguments if isinstance(uri, Input | Output)]

@@ -10,11 +10,10 @@ from typing import Annotated, Any, TypeVar
 import torch
 from pydantic import Field, TypeAdapter
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, json_text, require_file
+from ucfrec.files.atomic import json_text, require_file, save_arrays
 
 REMEDY = "restore it or train again"
 """What to do about a damaged file."""
@@ -29,27 +28,8 @@ _Module = TypeVar("_Module", bound=nn.Module)
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write named tensors and metadata that JSON can represent, atomically; InputError if there is
     no space."""
-    plain: dict[str, Tensor] = {}
-    places = set()
-    for name, tensor in tensors.items():
-        plain[name] = tensor.detach().contiguous().cpu()
-        place = plain[name].untyped_storage().data_ptr()
-        if place in places:  # safetensors refuses tensors that share memory
-            plain[name] = plain[name].clone()
-        places.add(place)
-    with atomic_file(path) as scratch:
-        scratch.touch()
-        mode = scratch.stat().st_mode
-        try:
-            # One entry: safetensors writes several in any order, and files of equal content are to
-            # be equal.
-            save_file(plain, scratch, metadata={"about": json.dumps(metadata)})
-        except SafetensorError as error:
-            raise InputError(
-                f"{path} cannot be written ({error}); free disk space and run the command again"
-            ) from None
-        # safetensors restricts its files to their owner; give them the usual permissions.
-        scratch.chmod(mode)
+    plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
+    save_arrays(path, {name: tensor.numpy() for name, tensor in plain.items()}, metadata)
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -92,10 +72,7 @@ def load_weights(
     assign: bool = False,
 ) -> None:
     """Load `tensors`, which were read from `path`, into `module`; copied unless `assign`.
-
-    Raises:
-        InputError: they are the weights of another architecture.
-    """
+    InputError if they are the weights of another architecture."""
     try:
         module.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:
@@ -149,14 +126,11 @@ def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
     """Read `metrics.jsonl` in `folder`, also while the training is running.
 
     If a resumed training logged a step again, the later line is used. An incomplete last line is
-    ignored.
+    ignored. InputError if a line is not an object of a step and numbers.
 
     Returns:
         {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
         if the file does not exist.
-
-    Raises:
-        InputError: a line is not an object of a step and numbers.
     """
     path = folder / METRICS
     if not path.exists():

@@ -39,11 +39,9 @@ def leads() -> bool:
 def joined() -> Iterator[None]:
     """Join the other processes of `torchrun`, if it started this one among several.
 
-    Communication is by gloo, and by NCCL between GPUs, of which each process takes its own.
-    A process that is not the leader has nothing to save: TERM ends it at once, whatever it does.
-
-    Raises:
-        InputError: another process of the training has ended.
+    Communication is by gloo, and by NCCL between GPUs, of which each process takes its own. A
+    process that is not the leader has nothing to save: TERM ends it at once, whatever it does.
+    InputError if another process of the training has ended.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
@@ -87,10 +85,7 @@ def leader_first() -> Iterator[None]:
 
 def share(whole: int) -> slice:
     """The part of `whole` windows of a batch, or of anything divided, that is this process's.
-
-    Raises:
-        InputError: there are fewer of them than processes.
-    """
+    InputError if there are fewer of them than processes."""
     if whole < processes():
         raise InputError(
             f"a batch of {whole} cannot be divided among {processes()} processes; set "
@@ -129,15 +124,9 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
 def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     """The sum over processes of sparse gradients times their weights."""
     rows, values = gradient.indices()[0], gradient.values() * weight
-    sizes = [
-        torch.zeros(
-            1,
-            dtype=torch.int64,
-            device=rows.device,
-        )
-        for _ in range(processes())
-    ]
-    distributed.all_gather(sizes, torch.tensor([len(rows)], device=rows.device))
+    size = torch.tensor([len(rows)], device=rows.device)
+    sizes = [torch.empty_like(size) for _ in range(processes())]
+    distributed.all_gather(sizes, size)
     counts = [int(size) for size in sizes]
     # Messages have to be of one size, that of the largest.
     joined = []
@@ -146,18 +135,6 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
         padded[: len(part)] = part
         parts = [torch.empty_like(padded) for _ in range(processes())]
         distributed.all_gather(parts, padded)
-        joined.append(
-            torch.cat(
-                [
-                    part[:n]
-                    for part, n in zip(
-                        parts,
-                        counts,
-                        strict=True,
-                    )
-                ]
-            )
-        )
-    return torch.sparse_coo_tensor(
-        joined[0].unsqueeze(0), joined[1], gradient.shape, check_invariants=False
-    )
+        joined.append(torch.cat([part[:n] for part, n in zip(parts, counts, strict=True)]))
+    places, summands = joined[0].unsqueeze(0), joined[1]
+    return torch.sparse_coo_tensor(places, summands, gradient.shape, check_invariants=False)

@@ -94,9 +94,9 @@ def append_logs(
         remembered = StoreRecord.read(out).source.others
         if "made_of" not in remembered:
             raise InputError(f"{out} is a store that no update made; name another folder")
-        if other := [key for key in made_of if remembered["made_of"].get(key) != made_of[key]]:
+        if faults := [key for key in made_of if remembered["made_of"].get(key) != made_of[key]]:
             raise InputError(
-                f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "
+                f"{out} is a store of {' and of '.join(faults)}; give the same as before, or name "
                 "another folder"
             )
         _require_held_out(str(out), remembered["appended"])

@@ -305,7 +305,7 @@ def settle_mapping(
     it must have.
     """
     joined = [table for table in tables if table.of_exposures]
-    others = [table for table in tables if not table.of_exposures]
+    feedback = [table for table in tables if not table.of_exposures]
     columns = {
         name: text
         for name, text in mapping.columns.items()
@@ -315,7 +315,7 @@ def settle_mapping(
     if remembered is None:
         return replace(mapping, columns=columns), reward
     for name, text in remembered.columns.items():
-        having = others if name in _OF_JOIN else tables
+        having = feedback if name in _OF_JOIN else tables
         if name in mapping.columns or not having:
             continue
         if not text or _find_lacking(connection, having, text) is None:

@@ -216,8 +216,8 @@ def _select_part(
     narrow = opened.of(columns, raw)
     for name, time in times.items():
         sql, _ = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)
-        given = f"trim(CAST({time.sql} AS VARCHAR)) NOT IN ('', 'nan')"
-        if unread := _count(connection, f"{narrow.sql} WHERE {given} AND ({sql}) IS NULL"):
+        has_text = f"trim(CAST({time.sql} AS VARCHAR)) NOT IN ('', 'nan')"
+        if unread := _count(connection, f"{narrow.sql} WHERE {has_text} AND ({sql}) IS NULL"):
             fault = f"{name} is no time in {unread:,} rows; write ISO 8601, or nothing for no bound"
             raise InputError(f"{opened.files[0]}: {fault}")
         values[name] = sql
@@ -482,6 +482,6 @@ def item_tags(
     numbers, ranks = _rank_values(connection, " UNION ALL ".join(cases), DISTINCT_TAGS)
     places = np.arange(len(numbers)) - np.searchsorted(numbers, numbers)
     size = min(int(places.max(initial=-1)) + 1, TAGS_PER_ITEM)
-    tags, few = np.full((n_items, size), -1, dtype=np.int64), places < size
-    tags[numbers[few], places[few]] = ranks[few]
+    tags, fits = np.full((n_items, size), -1, dtype=np.int64), places < size
+    tags[numbers[fits], places[fits]] = ranks[fits]
     return tags

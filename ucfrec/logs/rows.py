@@ -487,9 +487,9 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     finite = np.abs(rewards) <= MAX_FLOAT
     rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
     keys = [~finite, np.where(finite, rule[duplicates], 0)]
-    others = [schema.OBSERVATION, schema.PROPENSITY, SESSION, schema.IS_RANDOM, CANDIDATE_SET]
-    others += [schema.POSITION, schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, _REQUEST]
-    for name in others:
+    columns = [schema.OBSERVATION, schema.PROPENSITY, SESSION, schema.IS_RANDOM, CANDIDATE_SET]
+    columns += [schema.POSITION, schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, _REQUEST]
+    for name in columns:
         if name in rows:
             keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
     return [rows["row"], *keys[::-1]]

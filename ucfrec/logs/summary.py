@@ -171,9 +171,9 @@ def require_rows(
         return
     n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
     if grown is not None and 0 < n_wanted == late + dropped["duplicate"]:
-        before = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.mapping.earliest_ms - 1}"
+        not_newer = f"{schema.TIMESTAMP} BETWEEN {EARLIEST_MS} AND {log.mapping.earliest_ms - 1}"
         # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
-        if log.one(f"SELECT count(*) FROM {ROWS} WHERE {before}")[0] >= late:
+        if log.one(f"SELECT count(*) FROM {ROWS} WHERE {not_newer}")[0] >= late:
             raise NoRowsError(
                 f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
                 f"of {_clock(log.mapping.earliest_ms - 1)} UTC; give newer logs"

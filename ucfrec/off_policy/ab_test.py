@@ -195,12 +195,8 @@ def compare_arms(
     an `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
     beforehand; None for 5% of the first arm's value. `shares` of the users were intended for the
     arms, by name; None for equal ones. `guardrails` are as `dwell_seconds >= -2%`; `by` is a column
-    or expression to show the difference by.
-
-    Raises:
-        InputError: a column is missing or no number, a value is infinite, or there are not two arms
-            with two users each.
-    """
+    or expression to show the difference by. InputError if a column is missing or no number, a value
+    is infinite, or there are not two arms with two users each."""
     fault = f"expected is {expected}; give a difference above 0, and below {_LARGEST:g}"
     require(expected is None or 1 / _LARGEST < expected < _LARGEST, fault)
     require(per in get_args(Per), f"per is {per!r}; give 'session' or 'item'")
@@ -319,10 +315,7 @@ def _sum_by_user(
 ) -> pd.DataFrame:
     """Sum of the values, numbers of values, rows and units of each user in each arm and part, ""
     for none; and the names of users of several arms. Units are sessions, or values without a gap.
-
-    Raises:
-        InputError: a column is missing, `measure` is no number, or a value is infinite.
-    """
+    InputError if a column is missing, `measure` is no number, or a value is infinite."""
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
         engine(files, folder, memory_limit) as connection,

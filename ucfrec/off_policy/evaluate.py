@@ -175,11 +175,8 @@ def evaluate_off_policy(
     options: EstimateOptions = DEFAULTS,
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under a policy, and a rule or its run's own, from logs
-    alone, read with `keep_unknown`: a step of an unknown item has weight 0.
-
-    Raises:
-        InputError: propensities are not probabilities, or there is only one user.
-    """
+    alone, read with `keep_unknown`: a step of an unknown item has weight 0. InputError if
+    propensities are not probabilities, or there is only one user."""
     if {*options.measures} != {*logged.measures} or (options.by and logged.groups is None):
         raise InputError("--guardrail and --by read further columns of logs: name the logs")
     rule, store = rule or trained.rule, logged.store

@@ -59,11 +59,7 @@ _OUR_MODULES = re.compile(r"(ucfrec|contextlib)(\.|$)")
 
 
 def require_logs(name: str, value: object) -> object:
-    """Check that a value is a frame, files or a store.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Check that a value is a frame, files or a store. InputError if it is something else."""
     if not (_are_paths(value) or isinstance(value, (pd.DataFrame, LogFiles, EpisodeStore))):
         raise InputError(
             f"{name} is {shown(value)}; give a pandas DataFrame with one row per interaction, or "
@@ -73,11 +69,8 @@ def require_logs(name: str, value: object) -> object:
 
 
 def read_split(name: str, value: object) -> tuple[float, ...]:
-    """A split as `PrepareOptions.split` has it, of shares or of times in any form.
-
-    Raises:
-        InputError: `value` is neither.
-    """
+    """A split as `PrepareOptions.split` has it, of shares or of times in any form. InputError if
+    `value` is neither."""
     if not isinstance(value, Iterable):
         forms = "three shares, two times or 'leave-last-out'"
         raise InputError(f"{name} is {shown(value)}; give {forms}")
@@ -196,15 +189,12 @@ def open_files(
     trained: TrainedPolicy, logs: Logs, mapping: Columns | None
 ) -> Iterator[tuple[tuple[Path, ...], LogMapping, Path | None]]:
     """Later logs of a policy as files: the files, the mapping, and the file of a frame, which lasts
-    as long as the block; None for files.
-
-    Raises:
-        InputError: a path is missing, or the frame cannot be used.
-    """
+    as long as the block; None for files. InputError if a path is missing, or the frame cannot be
+    used."""
     columns = _read_columns(mapping)
-    used, reward = columns_used(trained, columns), reward_of(trained)
+    needed, reward = columns_used(trained, columns), reward_of(trained)
     with scratch_folder(Path(gettempdir()), "frame") as scratch:
-        yield _find_files(logs, columns, partial(later_logs, trained), scratch, used, reward)
+        yield _find_files(logs, columns, partial(later_logs, trained), scratch, needed, reward)
 
 
 def read_histories(
@@ -215,11 +205,8 @@ def read_histories(
     before_ms: int | None = None,
 ) -> Iterator[Histories]:
     """Histories of users before a time: of a frame, or None for what the store of the run has.
-
-    Raises:
-        InputError: the frame cannot be used, the store is gone, `users` is no list of ids, or one
-            of them has no rows.
-    """
+    InputError if the frame cannot be used, the store is gone, `users` is no list of ids, or one of
+    them has no rows."""
     stored = frame is None
     ids = None if users is None else require_ids("users", users, schema.USER_ID)
     if frame is None:
@@ -243,18 +230,18 @@ def _find_files(
     columns: LogMapping,
     resolve: Callable[[Sequence[str | Path], LogMapping], Resolved],
     scratch: Path,
-    used: LogMapping,
+    needed: LogMapping,
     reward: str | None,
 ) -> tuple[tuple[Path, ...], LogMapping, Path | None]:
     """Files of logs, their mapping, and the file in `scratch` to which a frame is written: the
-    columns that are `used`, or that the `reward` reads."""
+    columns that are `needed`, or that the `reward` reads."""
     if isinstance(logs, LogFiles):
         return logs.files, columns.over(logs.mapping), None
     if _are_paths(logs):
         paths = [logs] if isinstance(logs, (str, Path)) else list(logs)
         return *resolve(paths, columns), None
     file = scratch / _FRAME
-    pq.write_table(log_table(logs, "data", used, reward), file)
+    pq.write_table(log_table(logs, "data", needed, reward), file)
     return (file,), columns, file
 
 

@@ -24,15 +24,12 @@ def train_policy(
     refit: bool,
     callbacks: Callbacks = SILENT,
 ) -> RunRecord:
-    """Train a policy and write its model card.
+    """Train a policy and write its model card. Errors are those of `train_run`.
 
     Args:
         out: run folder; an interrupted run resumes.
         refit: whether it goes on learning from all rows once everything is chosen, which several
             processes do not; without it, the weights of the training rows are kept.
-
-    Raises:
-        InputError: as `train_run`.
     """
     record = train_run(store, out, config, callbacks=callbacks)
     if not refit:
@@ -64,11 +61,8 @@ class Scratch:
 
 
 def keep_beside(run: Path, store: EpisodeStore) -> EpisodeStore:
-    """A new store, moved beside the folder of its run.
-
-    Raises:
-        InputError: a store of other logs lies there already.
-    """
+    """A new store, moved beside the folder of its run. InputError if a store of other logs lies
+    there already."""
     place = run.with_name(run.name + STORE_SUFFIX)
     if not place.exists():
         store.path.rename(place)

@@ -23,14 +23,12 @@ _IMAGES = ("image_url", "image", "picture_url", "picture", "thumbnail")
 
 
 def read_features(path: Path, logs: Iterable[Source] = (), text_ids: bool = False) -> pa.Table:
-    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
+    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet. InputError
+    if the file cannot be read as that or lacks the column.
 
     Args:
         logs: of runs; their own name of the column is accepted in the file, too.
         text_ids: whether ids in CSV stay as they are written.
-
-    Raises:
-        InputError: the file cannot be read as that or lacks the column.
     """
     require_file(path, "name another file")
     mapped = ((log.mapping.get(schema.ITEM_ID) or schema.ITEM_ID).strip('"') for log in logs)

@@ -33,16 +33,14 @@ def rank_policies(
     seed: int,
     checkpoint: str = "best",
 ) -> Ranking:
-    """Rank what users were shown later, by policies of one store and by baselines.
+    """Rank what users were shown later, by policies of one store and by baselines. InputError if
+    `liked` cannot be used.
 
     Args:
         logs: their name in model cards; `TEST_SPLIT` for that of the store.
         liked: condition on the reward; None for the run's own.
         seed: of the bootstrap over users and of the random baseline.
         checkpoint: name of the policies' weights, here and below.
-
-    Raises:
-        InputError: `liked` cannot be used.
     """
     from ucfrec.evaluation.ranking import Later, LikedExpression
     from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
@@ -84,14 +82,11 @@ def estimate_return(
     seed: int,
     checkpoint: str = "best",
 ) -> "OffPolicyReport":
-    """Estimate the return of a session from logs.
+    """Estimate the return of a session from logs. InputError if the logs cannot be used.
 
     Args:
         logs: their names in the model card.
         seed: of the folds and the bootstrap.
-
-    Raises:
-        InputError: the logs cannot be used.
     """
     from ucfrec.off_policy.evaluate import evaluate_off_policy
 
@@ -115,11 +110,8 @@ def evaluate_in(
     seed: int,
     checkpoint: str = "best",
 ) -> Evaluation:
-    """Measure the return of policies and of built-in policies in a simulator.
-
-    Raises:
-        InputError: a policy does not fit the environment, or it has no such behavior.
-    """
+    """Measure the return of policies and of built-in policies in a simulator. InputError if a
+    policy does not fit the environment, or it has no such behavior."""
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 
     rows = []

@@ -27,11 +27,8 @@ if TYPE_CHECKING:
 
 
 def write_card(run: Path) -> Path:
-    """Write the card of a finished run, from its record and what was measured so far.
-
-    Raises:
-        InputError: `run` is not a run folder.
-    """
+    """Write the card of a finished run, from its record and what was measured so far. InputError if
+    `run` is not a run folder."""
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
     fit, times, splits = record.policy, record.data.time_range_ms, record.data.split_times_ms

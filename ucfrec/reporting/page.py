@@ -59,11 +59,8 @@ class _Run:
 def write_report(
     out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
 ) -> None:
-    """Write `render_report` to a file, atomically.
-
-    Raises:
-        InputError: `out` is a folder, or as `render_report`.
-    """
+    """Write `render_report` to a file, atomically. InputError if `out` is a folder, or as of
+    `render_report`."""
     page = render_report(runs, results, items)
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.
@@ -74,13 +71,11 @@ def render_report(
     runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
 ) -> str:
     """A self-contained HTML page about `runs`; those on the same data share a section and charts.
+    InputError if a folder is not a run, or a file has no results or features.
 
     Args:
         results: files of `--json`, of any command, or of result rows.
         items: item features to show with the sample recommendations, for `read_features`.
-
-    Raises:
-        InputError: a folder is not a run, or a file has no results or features.
     """
     loaded = _read_runs(runs)
     findings = read_findings(results)

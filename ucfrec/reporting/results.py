@@ -51,11 +51,8 @@ class Finding:
 
 def read_findings(paths: Sequence[Path]) -> list[Finding]:
     """What the results in files of `--json` and files of result rows (`.jsonl`) say; all estimates
-    from logs share a chart, that of the first of them.
-
-    Raises:
-        InputError: a file is missing or holds no results.
-    """
+    from logs share a chart, that of the first of them. InputError if a file is missing or holds no
+    results."""
     findings, rows = list[Finding](), list[ResultRow]()
     for path in paths:
         if path.suffix == ".json" and isinstance(values := read_json(path), dict) and values:

@@ -163,10 +163,7 @@ _ROWS = TypeAdapter(ResultRow)
 
 def row_from_json(text: str, where: str) -> ResultRow:
     """Inverse of `ResultRow.to_json`, of JSON; messages name the origin `where` (file and line).
-
-    Raises:
-        InputError: `text` is no object, or a field is missing, unknown or of a wrong type.
-    """
+    InputError if `text` is no object, or a field is missing, unknown or of a wrong type."""
     try:
         row = _ROWS.validate_json(text)
         if row.metric in row.metrics:
@@ -179,11 +176,8 @@ def row_from_json(text: str, where: str) -> ResultRow:
 
 
 def read_rows(path: Path) -> list[ResultRow]:
-    """Read the rows of a file; none if it does not exist.
-
-    Raises:
-        InputError: a line is not a result row, or the file is not UTF-8 text.
-    """
+    """Read the rows of a file; none if it does not exist. InputError if a line is not a result row,
+    or the file is not UTF-8 text."""
     return [
         row_from_json(line, f"{path}, line {number}")
         for number, line in enumerate(_read_text(path).split("\n"), start=1)
@@ -192,11 +186,8 @@ def read_rows(path: Path) -> list[ResultRow]:
 
 
 def read_results(path: Path) -> list[ResultRow]:
-    """Read the rows of JSON lines, or of a JSON list as commands write with `--json`.
-
-    Raises:
-        InputError: the file is missing or has other content.
-    """
+    """Read the rows of JSON lines, or of a JSON list as commands write with `--json`. InputError if
+    the file is missing or has other content."""
     if path.suffix != ".json" and path.exists() and not _read_text(path).startswith("["):
         return read_rows(path)
     rows = atomic.read_json(path)
@@ -376,10 +367,7 @@ class ResultTable:
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
         """Draw the picture of `report`: a metric of every method, by default that of the rows, with
         its 95% interval; of `ope`, the estimate that the verdict is of and the logged return.
-
-        Raises:
-            InputError: no row has the metric.
-        """
+        InputError if no row has the metric."""
         from matplotlib import pyplot
 
         from ucfrec.results.charts import draw_intervals

@@ -86,12 +86,12 @@ def group_auc(
 
 def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:
     """95% percentile bootstrap interval (low, high) of the mean of `values` (N,)."""
-    means = resampled_ratios(values[:, None], np.ones((len(values), 1)), seed)
+    means = resample_ratios(values[:, None], np.ones((len(values), 1)), seed)
     low, high = np.nanquantile(means, [0.025, 0.975])
     return float(low), float(high)
 
 
-def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
+def resample_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
     """Ratios Σ above / Σ below (`_RESAMPLES`, C) of rows (N, C) drawn with replacement; NaN for
     a denominator of 0."""
     generator = np.random.default_rng(seed)

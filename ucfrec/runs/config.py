@@ -78,13 +78,13 @@ def resolve_config(
             not allowed; the message names the source of the setting.
     """
     of_file = {} if file is None else read_toml(file)
-    settings = [*_from_mapping(presets or {}, "presets"), *_from_mapping(of_file, str(file))]
-    return _build(policy_name, [*settings, *_from_overrides(overrides)], seed)
+    settings = [*_read_mapping(presets or {}, "presets"), *_read_mapping(of_file, str(file))]
+    return _build(policy_name, [*settings, *_read_overrides(overrides)], seed)
 
 
 def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
     """Settings, in any form that `resolve_config` takes, as `{"table.field": value}`."""
-    return {f"{table}.{key}": value for table, key, value, _ in _from_overrides(overrides)}
+    return {f"{table}.{key}": value for table, key, value, _ in _read_overrides(overrides)}
 
 
 def config_from_dict(values: object) -> Config:
@@ -95,7 +95,7 @@ def config_from_dict(values: object) -> Config:
         raise InputError("the run's configuration has no policy_name or no seed")
     tables = {**values}
     name, seed = tables.pop("policy_name"), tables.pop("seed")
-    return _build(str(name), _from_mapping(tables, "the run's configuration"), seed)
+    return _build(str(name), _read_mapping(tables, "the run's configuration"), seed)
 
 
 _Setting: TypeAlias = tuple[str, str, Any, str]
@@ -109,7 +109,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not policy_type.augmented:
         tables["augment"]["copies"] = 0
-    for table, key, value, source in (*_from_mapping(policy_type.presets, policy_name), *settings):
+    for table, key, value, source in (*_read_mapping(policy_type.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:
@@ -120,9 +120,9 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
         raise InputError(f"{source}: {error}" if source else str(error)) from None
 
 
-def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_Setting]:
+def _read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_Setting]:
     if isinstance(overrides, Mapping):
-        yield from _from_mapping(overrides, "settings")
+        yield from _read_mapping(overrides, "settings")
         return
     if isinstance(overrides, str) or not isinstance(overrides, Iterable):
         raise InputError(f"settings is {shown(overrides)}; give a list of texts, or a mapping")
@@ -140,7 +140,7 @@ def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_S
         yield table, key, parsed, source
 
 
-def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
+def _read_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
     for name, value in values.items():
         table, dot, key = str(name).partition(".")
         _require_table(table, source)

@@ -17,13 +17,11 @@ def later_logs(
     trained: TrainedPolicy, paths: Sequence[str | Path], stated: LogMapping
 ) -> tuple[tuple[Path, ...], LogMapping]:
     """Log files of the dataset that a policy was trained on, whose columns may have plain names.
+    InputError if a path is missing, or holds no log of the dataset.
 
     Args:
         paths: files, folders and globs.
         stated: what the caller says of the columns.
-
-    Raises:
-        InputError: a path is missing, or holds no log of the dataset.
     """
     source = trained.record.data
     # A record may also name a dataset that is not read by an adapter.

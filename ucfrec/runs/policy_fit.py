@@ -37,7 +37,8 @@ def fit_policy(
     callbacks: Callbacks = SILENT,
     augmented: AugmentedEpisodes | None = None,
 ) -> Fit:
-    """Train the policy in place, or resume its training.
+    """Train the policy in place, or resume its training. InputError as of
+    `ucfrec.fitting.loop.fit`, or if the batch has fewer windows than processes.
 
     Args:
         validation: held-out episodes; None to keep the last weights.
@@ -46,9 +47,6 @@ def fit_policy(
         newest: positions in `train` of episodes that half of every batch is drawn from; None to
             draw all uniformly.
         augmented: episodes to learn from in addition to those of `train`.
-
-    Raises:
-        InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
     """
     k, device, folder = policy.config.context, policy.state_mean.device, out / "policy"
     solve = policy.make_solver(train, validation, folder, config.seed)

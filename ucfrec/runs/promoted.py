@@ -50,12 +50,9 @@ def promoted(folder: Path) -> Promoted | None:
 
 
 def promote(run: Path, force: bool = False) -> Promoted:
-    """Make a run the current one of the folder that it lies in.
-
-    Raises:
-        InputError: the run is a link, not finished or damaged, or, without `force`, is not an
-            update of the current run, or reliably worse by any measure.
-    """
+    """Make a run the current one of the folder that it lies in. InputError if the run is a link,
+    not finished or damaged, or, without `force`, is not an update of the current run, or reliably
+    worse by any measure."""
     if run.is_symlink():
         raise InputError(
             f"{run} is a link, and the run would be promoted in the folder where it really lies; "
@@ -77,11 +74,8 @@ def promote(run: Path, force: bool = False) -> Promoted:
 
 
 def promote_back(folder: Path) -> Promoted:
-    """Return to the run that was current before the current one.
-
-    Raises:
-        InputError: there is none, or it is gone or damaged.
-    """
+    """Return to the run that was current before the current one. InputError if there is none, or it
+    is gone or damaged."""
     with claim(folder / POINTER, wait=True):
         pointer = promoted(folder)
         if pointer is None or not pointer.previous:

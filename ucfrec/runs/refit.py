@@ -24,13 +24,11 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     many steps as the training had, or where items come and go as these weights had, while the
     learning rate falls to 0; policies that are fitted without gradients are fitted again. Item
     embeddings stay those of the store's training split. There is nothing left to evaluate the
-    policy on but later logs.
+    policy on but later logs. InputError if `first` is not a finished run on this store, or `out` is
+    another run.
 
     Args:
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
-
-    Raises:
-        InputError: `first` is not a finished run on this store, or `out` is another run.
     """
     trained = TrainedPolicy.load(first, split=True)
     if not trained.record.is_of(store.record):

@@ -51,10 +51,8 @@ _CRM_EPOCHS = 5
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     """The training and the validation episodes of a store.
 
-    Without a validation split, every tenth training episode is held out for validation.
-
-    Raises:
-        InputError: the store has fewer than 2 training episodes.
+    Without a validation split, every tenth training episode is held out for validation. InputError
+    if the store has fewer than 2 training episodes.
     """
     train, validation = store.split("train"), store.split("validation")
     if train.n_episodes < 2:
@@ -233,11 +231,8 @@ def policy_sizes(store: EpisodeStore) -> dict[str, int]:
 
 @random_state_kept()
 def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
-    """An untrained policy with the normalisation and item embeddings of `train`.
-
-    Raises:
-        InputError: the policy does not support the actions of `train`.
-    """
+    """An untrained policy with the normalisation and item embeddings of `train`. InputError if the
+    policy does not support the actions of `train`."""
     torch.manual_seed(config.seed)
     policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
     mean, std = train.state_statistics

@@ -20,11 +20,8 @@ Value = bool | int | float | str
 
 @dataclass(frozen=True)
 class Dimension:
-    """Values of one setting: some choices, or a range.
-
-    Raises:
-        InputError: it is neither, or its ends are in the wrong order.
-    """
+    """Values of one setting: some choices, or a range. InputError if it is neither, or its ends are
+    in the wrong order."""
 
     choices: tuple[Value, ...] = ()
     low: float | None = None
@@ -73,11 +70,7 @@ REWARD_WEIGHTS: Space = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4
 
 def read_space(path: Path) -> Space:
     """Read a TOML file with the tables of a configuration, whose fields are lists of choices or
-    ranges `{low = …, high = …, log = true}`.
-
-    Raises:
-        InputError: it has another form.
-    """
+    ranges `{low = …, high = …, log = true}`. InputError if it has another form."""
     space = {}
     for table, fields in read_toml(path).items():
         if table not in TABLES or not isinstance(fields, dict):
@@ -96,11 +89,8 @@ def read_space(path: Path) -> Space:
 
 @dataclass(frozen=True)
 class Search:
-    """Policies, their spaces, and the settings that all trials have.
-
-    Raises:
-        InputError: a policy is unknown, or a value of a space is not allowed.
-    """
+    """Policies, their spaces, and the settings that all trials have. InputError if a policy is
+    unknown, or a value of a space is not allowed."""
 
     policies: tuple[str, ...]
     fixed: Mapping[str, Any]

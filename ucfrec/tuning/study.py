@@ -62,11 +62,8 @@ def measure_run(
     metric: str,
     k: int,
 ) -> float:
-    """The metric of a finished run on its store, one of `METRICS`; higher is better.
-
-    Raises:
-        InputError: the run or its validation rows do not have the metric.
-    """
+    """The metric of a finished run on its store, one of `METRICS`; higher is better. InputError if
+    the run or its validation rows do not have the metric."""
     if metric == VALUE:
         rule = trained.record.rule
         if rule is None or rule.estimate is None:
@@ -108,12 +105,9 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
-    settings, `tuning.md` all trials.
-
-    Raises:
-        InputError: the folder holds another search, the numbers are out of range, the policies have
-            no such metric on this store, no trial could be measured, or the study's file is damaged
-            or cannot be written.
+    settings, `tuning.md` all trials. InputError if the folder holds another search, the numbers are
+    out of range, the policies have no such metric on this store, no trial could be measured, or the
+    study's file is damaged or cannot be written.
     """
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")

@@ -29,7 +29,8 @@ from ucfrec_control.training.train import dataset_of, find_preset, preset_of
 def score_cells(
     data: Path, folder: Path, budget: Budget, table: str, methods: Sequence[str] = ()
 ) -> Iterator[Cell]:
-    """The cells of a table of scores; writes the stores that they need.
+    """The cells of a table of scores; writes the stores that they need. InputError if a file is
+    missing, or a method is not in the table.
 
     Args:
         data: folder of the HDF5 files.
@@ -37,9 +38,6 @@ def score_cells(
         budget: as `budget_of` returns it.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.
-
-    Raises:
-        InputError: a file is missing, or a method is not in the table.
     """
     selected = _select(TABLES[table], methods or budget.methods)
     plan = _plan(SCORES, folder, budget)

@@ -46,11 +46,8 @@ class Evaluate(Table):
     """Write the result rows here."""
 
     def execute(self) -> None:
-        """Run `ucfrec-control evaluate`.
-
-        Raises:
-            InputError: a run or its environment cannot be used, or no run takes the --target.
-        """
+        """Run `ucfrec-control evaluate`. InputError if a run or its environment cannot be used, or
+        no run takes the --target."""
         if self.target:
             _explain_targets(self.runs)
         if self.video is not None:

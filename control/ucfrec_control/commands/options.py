@@ -61,12 +61,8 @@ class SourceOptions(Table):
     """Let Minari fetch the dataset."""
 
     def read_source(self) -> Trajectories:
-        """Read the dataset.
-
-        Raises:
-            InputError: it is missing, damaged, of another format, or of other sizes than `--env`
-                has.
-        """
+        """Read the dataset. InputError if it is missing, damaged, of another format, or of other
+        sizes than `--env` has."""
         if is_minari(self.source):
             return read_minari(self.source, self.env, self.download)
         return read_d4rl(Path(self.source), self.env)
@@ -91,11 +87,7 @@ class ControlGridOptions(GridOptions):
     workers: Annotated[int, POSITIVE] = 1
 
     def require_data(self) -> Path:
-        """The folder of the HDF5 files.
-
-        Raises:
-            InputError: no folder is given.
-        """
+        """The folder of the HDF5 files. InputError if no folder is given."""
         if self.data is None:
             raise InputError(
                 "name the folder of the HDF5 files with --data, or give --show-only for the rows "
@@ -106,8 +98,7 @@ class ControlGridOptions(GridOptions):
     def explain_rows(self) -> AbstractContextManager[None]:
         """For the block that prints rows: with --show-only, an `InputError` says what they lack.
         Rows that were just measured lack nothing: there an error is ours, and keeps its trace."""
-        shown = damage_explained(self.rows_file, ROWS_REMEDY)
-        return shown if self.show_only else nullcontext()
+        return damage_explained(self.rows_file, ROWS_REMEDY) if self.show_only else nullcontext()
 
     def measure(self, cells: Iterable[Cell], how: Measurement, describe: str) -> list[ResultRow]:
         """The rows of cells, which are measured where they have none."""

@@ -40,11 +40,7 @@ class Part:
         return replace(budget, tasks=self.files) if self.files else budget
 
     def cells(self, data: Path, folder: Path, budget: Budget) -> Iterator[Cell]:
-        """The cells of the part; writes the stores that they need.
-
-        Raises:
-            InputError: a file is missing.
-        """
+        """The cells of the part, whose stores are written. InputError if a file is missing."""
         if self.table == ROBUSTNESS:
             return robustness_cells(data, folder, budget, self.methods, self.distractors)
         return score_cells(data, folder, budget, self.table, self.methods)

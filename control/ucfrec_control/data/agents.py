@@ -87,13 +87,9 @@ class Agent(Memoryless):
 
 def read_agent(file: Path, observations: int, space: Box, noise: float, seed: int) -> Agent:
     """Read an agent of Stable-Baselines3, for an environment with observations of this size;
-    further arguments as of `Agent`.
-
-    Raises:
-        InputError: the file is missing or damaged, or its network is not one of layers that its
-            tensors determine in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of
-            other sizes.
-    """
+    further arguments as of `Agent`. InputError if the file is missing or damaged, or its network is
+    not one of layers that its tensors determine in full (perceptrons of SAC, TQC, TD3, DDPG, PPO,
+    A2C or TRPO), or of other sizes."""
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)
     expected = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}

@@ -28,7 +28,9 @@ _COLUMNS: Final = (
 def collect_agent(
     agent: Path, env_id: str, out: Path, *, noise: float, size: int, seed: int
 ) -> dict[str, Any]:
-    """Let a saved agent act and write a dataset in D4RL's layout.
+    """Let a saved agent act and write a dataset in D4RL's layout. InputError if the agent cannot be
+    read as data or does not fit the environment, the environment cannot be made, `noise` is
+    negative or not finite, `size` is below 1, or `out` is complete already.
 
     Args:
         agent: file that Stable-Baselines3 or its contrib package saved.
@@ -39,11 +41,6 @@ def collect_agent(
 
     Returns:
         `file`, `dataset`, numbers of `trajectories` and `steps`, and undiscounted `mean_return`.
-
-    Raises:
-        InputError: the agent cannot be read as data or does not fit the environment, which cannot
-            be made; `noise` is negative or not finite, or `size` below 1; or `out` is complete
-            already.
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
@@ -83,9 +80,7 @@ def roll_out(actor: Actor, env_id: str, size: int, seed: int, describe: str) -> 
     """Roll out whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
-
-    Raises:
-        InputError: the environment cannot be made.
+    InputError if the environment cannot be made.
     """
     # A small `size` needs few parallel episodes: the usual step limit of these tasks is 1000.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
@@ -94,10 +89,10 @@ def roll_out(actor: Actor, env_id: str, size: int, seed: int, describe: str) -> 
     with progress(size, describe, "steps") as bar:
         while (done := sum(len(step.rewards) for step in steps)) < size:
             bar.update(done - bar.n)
-            before, number = len(steps), len(rounds)
+            earlier, number = len(steps), len(rounds)
             episode_seed = _derive_seed(seed, 6, number)
             rollout(env, actor, env.num_envs, episode_seed, steps.append, describe="episodes")
-            rounds.append(np.repeat(number, sum(len(step.rewards) for step in steps[before:])))
+            rounds.append(np.repeat(number, sum(len(step.rewards) for step in steps[earlier:])))
     env.close()
     columns = {name: np.concatenate([getattr(step, name) for step in steps]) for name in _COLUMNS}
     # The episodes of a round ran in parallel; each becomes contiguous.

@@ -33,15 +33,13 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     A trajectory ends at `terminals` or `timeouts`. Steps after the last end are an unfinished
     trajectory and are dropped; in AntMaze, so are trajectories of one step, which are the ant still
     standing on the goal. A file without `timeouts` shows where trajectories end by
-    `next_observations` that the next row does not begin with.
+    `next_observations` that the next row does not begin with. InputError if the file is missing,
+    damaged or not of this layout, or its observations and actions have other sizes than D4RL's of
+    that environment.
 
     Args:
         env_id: environment that the data is of; None for the one that the file names, or D4RL's
             environment for the task in the file's name.
-
-    Raises:
-        InputError: the file is missing, damaged or not of this layout, or its observations and
-            actions have other sizes than D4RL's of that environment.
     """
     with open_hdf5(path) as file:
         missing = [name for name in _REQUIRED if name not in file]
@@ -166,12 +164,9 @@ def _made_with(path: Path) -> dict[str, str]:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """Yield the file, opened for reading, in which no link leads out of it.
-
-    Raises:
-        InputError: the file is missing, damaged or not HDF5, links to another file or stores values
-            in one, or reading it in the block fails.
-    """
+    """Yield the file, opened for reading, in which no link leads out of it. InputError if the file
+    is missing, damaged or not HDF5, links to another file or stores values in one, or reading it in
+    the block fails."""
     if not path.is_file():
         raise InputError(f"{path} does not exist")
     try:
@@ -189,14 +184,12 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
 
 def read_numbers(file: Any, path: Path, name: str) -> Array:
-    """A data set of numbers in memory, of at most two dimensions; floats become float32.
+    """A data set of numbers in memory, of at most two dimensions; floats become float32. InputError
+    if it is not a data set of numbers, claims more values than the file can hold, has numbers
+    beyond single precision, or cannot be read.
 
     Args:
         name: of the data set, which may lie in groups: `infos/final_observations`.
-
-    Raises:
-        InputError: it is not a data set of numbers, claims more values than the file can hold,
-            has numbers beyond single precision, or cannot be read.
     """
     dataset = file
     for part in name.split("/"):
@@ -220,11 +213,8 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
 
 
 def convert_singles(values: Array, where: str, name: str) -> Float32Array:
-    """Numbers from the source `where`, called `name` in the plural, in single precision.
-
-    Raises:
-        InputError: a finite number is beyond single precision.
-    """
+    """Numbers from the source `where`, called `name` in the plural, in single precision. InputError
+    if a finite number is beyond single precision."""
     with np.errstate(over="ignore"):
         singles = values.astype(np.float32)
     beyond = int(np.count_nonzero(np.isinf(singles) & np.isfinite(values)))
@@ -237,11 +227,8 @@ def convert_singles(values: Array, where: str, name: str) -> Float32Array:
 
 
 def require_inside(path: Path) -> None:
-    """Check that no data set or group of a file leads out of it.
-
-    Raises:
-        InputError: one does, or the file is damaged.
-    """
+    """Check that no data set or group of a file leads out of it. InputError if one does, or
+    the file is damaged."""
     with open_hdf5(path) as file:
         waiting, seen = [file], 0
         while waiting:

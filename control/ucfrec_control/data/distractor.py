@@ -29,12 +29,10 @@ def add_distractor(
     store: EpisodeStore, out: Path, flip: float = 0.0, seed: int = 0, early: bool = False
 ) -> EpisodeStore:
     """Write a copy of `store` with a reward-indicating bit appended to every observation.
+    InputError if `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
 
     Args:
         flip, early: as of `ucfrec.episodes.writer.reward_bit`.
-
-    Raises:
-        InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
     """
     if store.has_items:
         raise InputError(f"{store.path} is of item logs; distractors are for observed states")
@@ -47,11 +45,8 @@ def add_distractor(
 
 def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:
     """The store of `FILE.hdf5` in `data` with one of `DISTRACTORS`, written if it does not exist.
-
-    Raises:
-        InputError: the HDF5 file is missing, invalid or not that of the store, or the distractor
-            cannot be added.
-    """
+    InputError if the HDF5 file is missing, invalid or not that of the store, or the distractor
+    cannot be added."""
     clean, path = stores / file, data / f"{file}.hdf5"
     if not clean.exists():
         read_d4rl(path).write_store(clean)

@@ -52,14 +52,12 @@ def make_env(
 
     They share one process because measurements showed that a MuJoCo step costs less than
     communication between processes. AntMaze gets D4RL's observation vectors, and its episodes
-    return 1 for success and 0 otherwise.
+    return 1 for success and 0 otherwise. InputError if the environment is not registered or cannot
+    be made.
 
     Args:
         appended: constants that stand in for distractors at the end of every observation.
         wrappers: wrappers around each environment, the innermost first.
-
-    Raises:
-        InputError: the environment is not registered or cannot be made.
     """
     settings, wrappers = dict(settings or {}), list(wrappers)
     skip = settings.get("frame_skip", 1)
@@ -96,11 +94,8 @@ def make_env(
 
 def environment_of_data(dataset: Mapping[str, Any]) -> str:
     """The environment that a dataset names, of which `dataset` is the `source` of its store.
-
-    Raises:
-        InputError: it names none, or one with a Python module, which Gymnasium would import: data
-            does not choose what code runs.
-    """
+    InputError if it names none, or one with a Python module, which Gymnasium would import: data
+    does not choose what code runs."""
     name, env_id = dataset["dataset"], dataset["env_id"]
     if env_id is None:
         raise InputError(
@@ -140,11 +135,8 @@ def is_antmaze(env_id: str) -> bool:
 
 def antmaze_settings(env_id: str) -> Mapping[str, Any]:
     """Register the environments of gymnasium-robotics; returns arguments of `gymnasium.make` with
-    which an episode of an AntMaze returns 1 for success and 0 otherwise.
-
-    Raises:
-        InputError: gymnasium-robotics is not installed.
-    """
+    which an episode of an AntMaze returns 1 for success and 0 otherwise. InputError if
+    gymnasium-robotics is not installed."""
     try:
         # The import prints a notice about environments that are not used here.
         with redirect_stderr(StringIO()):

@@ -76,10 +76,10 @@ TASKS = (
 )
 
 
-def find_task(name: str | None, other: str | None = None) -> Task | None:
+def find_task(name: str | None, second_name: str | None = None) -> Task | None:
     """The task of a name of an environment, file or dataset, else of another name; None if neither
     belongs to one."""
-    plain = [_plain(text or "") for text in (name, other)]
+    plain = [_plain(text or "") for text in (name, second_name)]
     return next((task for text in plain for task in TASKS if task.pattern in text), None)
 
 

@@ -35,11 +35,8 @@ _ROUNDING = 1e-5
 
 
 def store_of(run: Path) -> EpisodeStore:
-    """The store that a run was trained on, without dropped dimensions.
-
-    Raises:
-        InputError: the store was moved, removed or changed.
-    """
+    """The store that a run was trained on, without dropped dimensions. InputError if the store was
+    moved, removed or changed."""
     record = RunRecord.read(run)
     store = trained_store(run, record)
     if store is None:
@@ -57,11 +54,8 @@ def is_augmented(run: Path) -> bool:
 
 def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
-    training mean; at most 3,000 drawn from a run's counterfactual copies.
-
-    Raises:
-        InputError: the run made no copies, or no edit of them was accepted, or its store is gone.
-    """
+    training mean; at most 3,000 drawn from a run's counterfactual copies. InputError if the run
+    made no copies, or no edit of them was accepted, or its store is gone."""
     _augmentation(run)
     store = store_of(run)
     copies = AugmentedEpisodes.load(run / AUGMENTED)
@@ -92,10 +86,7 @@ class Editing:
     @classmethod
     def of(cls, run: Path, seed: int = 0) -> "Editing":
         """Read back the models of `run`, and draw 4,096 of the steps that it could have edited.
-
-        Raises:
-            InputError: the run made no copies, or its models or its store are gone.
-        """
+        InputError if the run made no copies, or its models or its store are gone."""
         record, report = RunRecord.read(run), _augmentation(run)
         config, sizes = record.config, record.sizes
         train = training_views(store_of(run))[0]
@@ -141,11 +132,8 @@ class Editing:
 
 
 def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> Float64Array:
-    """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high.
-
-    Raises:
-        InputError: as `Editing.of`.
-    """
+    """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high. InputError as
+    `Editing.of`."""
     editing = Editing.of(run)
     return np.array(
         [[editing.acceptance((a, b)) if a < b else np.nan for b in highs] for a in lows]
@@ -153,11 +141,8 @@ def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) ->
 
 
 def move_histogram(run: Path) -> tuple[tuple[float, ...], tuple[int, ...], tuple[float, float]]:
-    """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂.
-
-    Raises:
-        InputError: the run made no copies.
-    """
+    """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂. InputError if
+    the run made no copies."""
     moves = _augmentation(run).moves
     return moves.histogram_edges, moves.histogram_counts, RunRecord.read(run).config.csg.band
 
@@ -165,10 +150,8 @@ def move_histogram(run: Path) -> tuple[tuple[float, ...], tuple[int, ...], tuple
 def attention(run: Path, seed: int = 0) -> Float64Array:
     """(K, 3, K) attention of a UCF run from s_t to R, s and a of every step.
 
-    The mean over heads and over full windows of validation episodes; a row sums to one.
-
-    Raises:
-        InputError: the policy is not UCF, no episode fills a window, or the store is gone.
+    The mean over heads and over full windows of validation episodes; a row sums to one. InputError
+    if the policy is not UCF, no episode fills a window, or the store is gone.
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):

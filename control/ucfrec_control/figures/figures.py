@@ -50,7 +50,8 @@ class _Plan:
 def make_figures(
     runs: Sequence[Path], results: Sequence[Path], out: Path
 ) -> tuple[list[Path], list[str]]:
-    """Draw all figures into `out`, as PNG and SVG.
+    """Draw all figures into `out`, as PNG and SVG. InputError if a folder or file is missing, or
+    holds something else.
 
     Args:
         runs: run folders of `ucfrec-control`, or folders that hold some at any depth.
@@ -58,9 +59,6 @@ def make_figures(
 
     Returns:
         The files written, and a line for each figure that lacks its data.
-
-    Raises:
-        InputError: a folder or file is missing, or holds something else.
     """
     rows = [row for path in results for row in read_results(path)]
     plans = [plan for folder in runs for plan in _plan_runs(folder)]

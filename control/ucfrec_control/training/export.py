@@ -68,13 +68,11 @@ class WindowGraph(nn.Module):
 
 def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
     """Write `model.onnx` and `model.json`, which says what its inputs are, to a new folder.
+    InputError if `run` is not a finished run of `ucfrec-control train`, is of IQL or CQL, the extra
+    `export` is missing, the graph differs from torch, or `out` exists.
 
     Returns:
         The largest difference to torch, relative to the largest action; at most 1e-5.
-
-    Raises:
-        InputError: `run` is not a finished run of `ucfrec-control train`, is of IQL or CQL, the
-            extra `export` is missing, the graph differs from torch, or `out` exists.
     """
     trained = load_run(run, checkpoint)
     if not isinstance(trained, TrainedPolicy):

@@ -76,11 +76,8 @@ def estimate(
     """Estimate the discounted return of a policy from trajectories of the same robot.
 
     Of trajectories that the step limit ended, the last step is not regressed, because the state
-    after it is unknown; the behaviour's return goes on with the estimate there.
-
-    Raises:
-        InputError: `discount` is not in (0, 1), the store is of other sizes, or no trajectory has
-            two steps.
+    after it is unknown; the behaviour's return goes on with the estimate there. InputError if
+    `discount` is not in (0, 1), the store is of other sizes, or no trajectory has two steps.
     """
     if not 0 < discount < 1:
         raise InputError(f"--discount is {discount:g}; give a number between 0 and 1")
@@ -106,7 +103,7 @@ def estimate(
         of_policy.converged and of_behaviour.converged,
         len(store.lengths) < _GROUPS,
     )
-    returns, half, value = model.logged_returns(of_behaviour.weights), 0.0, of_policy.value
+    returns, half, value = model.average_logged(of_behaviour.weights), 0.0, of_policy.value
     reasons = []
     if not converged:
         reasons.append("the regressions did not settle")
@@ -222,7 +219,7 @@ class _Model:
                 break
         return weights, float(first @ weights / count), converged
 
-    def logged_returns(self, weights: Float64Array) -> Float64Array:
+    def average_logged(self, weights: Float64Array) -> Float64Array:
         """Discounted returns (E,) of the logged trajectories; where the step limit cut one, its
         last step counts by Q."""
         steps = np.arange(len(self._rewards)) - np.repeat(self._starts, self._lengths)

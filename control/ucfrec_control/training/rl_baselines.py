@@ -100,22 +100,15 @@ class RLRecord(TrainingRecord):
 
     @property
     def finished(self) -> RLFit:
-        """The report of the training.
-
-        Raises:
-            InputError: the training has not ended.
-        """
+        """The report of the training. InputError if the training has not ended."""
         if self.policy is None:
             raise InputError("the training of the run has not ended; train it to its end first")
         return self.policy
 
 
 def read_run(run: Path) -> RunRecord | RLRecord:
-    """The record of a run of ucfrec or of d3rlpy.
-
-    Raises:
-        InputError: `run` is not a run folder, or is damaged.
-    """
+    """The record of a run of ucfrec or of d3rlpy. InputError if `run` is not a run folder, or is
+    damaged."""
     rl = TrainingRecord.read(run).library == "d3rlpy"
     return RLRecord.read(run) if rl else RunRecord.read(run)
 
@@ -174,11 +167,8 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLR
 
     A finished run is read, not repeated. One that was killed and is started again ends with the
     same actor as one left alone (same machine and device). The global random state is as before on
-    return.
-
-    Raises:
-        InputError: d3rlpy is not installed, `out` is of another configuration or other data, or
-            another process is training in it.
+    return. InputError if d3rlpy is not installed, `out` is of another configuration or other data,
+    or another process is training in it.
     """
     with lock_path(out, "trained"):
         remove_leftovers(out, within=True)

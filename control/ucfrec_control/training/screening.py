@@ -158,17 +158,14 @@ def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
 
 @random_state_kept()
 def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Test the effect of every dimension of the states of training episodes.
-
-    Raises:
-        InputError: there are too few episodes to hold some out.
-    """
+    """Test the effect of every dimension of the states of training episodes. InputError if there
+    are too few episodes to hold some out."""
     torch.manual_seed(seed)
     data = _Data(train, config, seed)
     shared = _fit_shared(data)
     measures: dict[int, bool] = {}
 
-    def measured(dimensions: Sequence[int]) -> list[int]:
+    def select_measurements(dimensions: Sequence[int]) -> list[int]:
         """Those of `dimensions` that measure the reward."""
         if new := [dimension for dimension in dimensions if dimension not in measures]:
             measures.update(_find_measurements(data, new))
@@ -179,11 +176,11 @@ def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Sc
         r2 = _fit_own(shared, data, [()]).r2(0)
         if r2 >= config.min_reward_r2:
             # A measurement predicts the reward well, whatever else does.
-            leaks = measured(_find_helpful(shared, data))
+            leaks = select_measurements(_find_helpful(shared, data))
             r2 = _fit_own(shared, data, [leaks]).r2(0) if leaks else r2
     if hard := r2 < config.min_reward_r2:
         # Only what measures the reward can be without effect; the effects of the rest are excluded.
-        tested = measured(tested)
+        tested = select_measurements(tested)
     errors, none = _fit_own(shared, data, [*((d,) for d in tested), ()]), len(tested)
     reports, undecided = {}, []
     for row, dimension in enumerate(tested):
@@ -191,14 +188,14 @@ def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Sc
         if (hard or helps_reward) and not helps_next:
             undecided.append(dimension)
         reports[dimension] = replace(report, causes=hard or helps_next or helps_reward)
-    measured(undecided)
+    select_measurements(undecided)
     for dimension, report in reports.items():
         yes = measures.get(dimension)
         causes = report.causes and not (dimension in undecided and yes)
         reports[dimension] = replace(report, measures_reward=yes, causes=causes)
     flagged = [dimension for dimension, report in reports.items() if not report.causes]
     if len(flagged) > 1:
-        leaks = measured(flagged)
+        leaks = select_measurements(flagged)
         varies = (data.states != data.states[0]).any(0)
         untied = [d for d in flagged if d not in leaks and varies[d]]
         together = False

@@ -37,16 +37,13 @@ def record_episode(
     distractor: float = 0.0,
 ) -> float:
     """Roll out one episode, with the initial state of the first of `evaluate_run`, and keep its
-    frames.
+    frames. InputError as `evaluate_run`, or `out` exists, or the environment cannot be rendered.
 
     Args:
         out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the initial state.
             It is written when the episode has ended.
         checkpoint, env_id, distractor: as of `evaluate_run`.
         target: target return; None for the preset's first.
-
-    Raises:
-        InputError: as `evaluate_run`, or `out` exists, or the environment cannot be rendered.
     """
     if out.suffix not in ("", _VIDEO):
         raise InputError(

@@ -66,11 +66,8 @@ def simulated(
     environment: Environment, folder: Path, log: Log, behaviors: Sequence[str] = ()
 ) -> Task:
     """Any environment that needs no files, with logs of its mixture or, without one, of random
-    actions, and the built-in policies that are evaluated as references (all if empty).
-
-    Raises:
-        InputError: the environment cannot be made.
-    """
+    actions, and the built-in policies that are evaluated as references (all if empty). InputError
+    if the environment cannot be made."""
     behaviors = tuple(behaviors or environment.simulator().behaviors)
     store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), behaviors)
@@ -82,10 +79,8 @@ def kuairand(folder: Path, log: Log) -> Task:
 
     The training logs are cut into sessions by the exit rule. If the data folder has the random
     exposures, training uses the standard log up to 21 April and the environments are made from the
-    random rows, as in the public experiments. Otherwise the log is split at 28 April.
-
-    Raises:
-        InputError: the data folder lacks the official files.
+    random rows, as in the public experiments. Otherwise the log is split at 28 April. InputError if
+    the data folder lacks the official files.
     """
     source = data_folder("kuairand")
     files = log_files([source])
@@ -114,10 +109,7 @@ def kuairand(folder: Path, log: Log) -> Task:
 
 def kuairec(folder: Path, log: Log) -> Task:
     """KuaiRec: trained on the big matrix, cut by the exit rule; evaluated on the small matrix.
-
-    Raises:
-        InputError: the data folder lacks the official files.
-    """
+    InputError if the data folder lacks the official files."""
     source = data_folder("kuairec")
     files = log_files([source])
     logs = [file for file in files if file.name.startswith("big_matrix")]

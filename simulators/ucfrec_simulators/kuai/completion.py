@@ -132,15 +132,13 @@ def complete(
 
     Writes `users.parquet` (user_id, vector), `items.parquet` (item_id, vector, tags) and
     `completion.json`, atomically. The click probability of a pair is the logistic function of the
-    inner product of its vectors.
+    inner product of its vectors. InputError if rewards are not clicks, a split is empty, or `out`
+    exists.
 
     Args:
         store: logs of items with clicks (0 or 1) as rewards, split in time.
         tags: tags of each video id; a missing video has no tags.
         seed: seed of the initial weights and of the batches.
-
-    Raises:
-        InputError: rewards are not clicks, a split is empty, or `out` exists.
     """
     config, states = config or CompletionConfig(), store.item_states
     fitted, validation, test = (_rows(store.split(name)) for name in schema.SPLITS)

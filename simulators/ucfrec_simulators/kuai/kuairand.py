@@ -33,13 +33,11 @@ def kuairand(
     regime: Regime = REGIMES["FB"],
 ) -> KuaiEnv:
     """The environment of KuaiRand's users × videos; the reward is the probability of a click.
+    InputError if a file is missing.
 
     Args:
         folder: written by `ucfrec_simulators.kuai.completion.complete`; None for
             `kuairand-environment` in the data folder.
-
-    Raises:
-        InputError: a file is missing.
     """
     folder = folder or data_folder("kuairand-environment")
     for name in (USERS_FILE, ITEMS_FILE):
@@ -54,11 +52,8 @@ def kuairand(
 
 
 def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
-    """Tags of each video of a `video_features_basic` file; a video may have none.
-
-    Raises:
-        InputError: the file is missing or is not the official one.
-    """
+    """Tags of each video of a `video_features_basic` file; a video may have none. InputError if the
+    file is missing or is not the official one."""
     table = read_columns(path, ["video_id", "tag"], SOURCE)
     tags = table["tag"].fillna("").astype(str)
     return {video: parse_tags(text) for video, text in zip(table["video_id"], tags, strict=True)}

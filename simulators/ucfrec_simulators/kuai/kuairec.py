@@ -26,14 +26,12 @@ def kuairec(
     """The environment of 1,411 users × 3,327 videos.
 
     The reward is the raw `watch_ratio`, clipped at 5, and 0 for the 0.4% of pairs that were never
-    observed.
+    observed. InputError if a file is missing or is not the official one, or a video has no
+    categories.
 
     Args:
         folder: has `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
             folder.
-
-    Raises:
-        InputError: a file is missing or is not the official one, or a video has no categories.
     """
     folder = folder or data_folder("kuairec")
     watched = read_columns(
@@ -55,22 +53,16 @@ def kuairec(
 
 
 def read_categories(folder: Path) -> dict[int, tuple[int, ...]]:
-    """Categories of every video of the official `item_categories.csv` in `folder`.
-
-    Raises:
-        InputError: the file is missing or is not the official one.
-    """
+    """Categories of every video of the official `item_categories.csv` in `folder`. InputError if
+    the file is missing or is not the official one."""
     table = read_columns(folder / CATEGORIES, ["video_id", "feat"], SOURCE)
     categories = (parse_tags(text.strip("[]")) for text in table["feat"])
     return dict(zip(table["video_id"], categories, strict=True))
 
 
 def read_columns(path: Path, columns: Sequence[str], source: str) -> pd.DataFrame:
-    """Read columns of a CSV file; `source` is where to get it, for the error message.
-
-    Raises:
-        InputError: the file is missing or lacks a column.
-    """
+    """Read columns of a CSV file; `source` is where to get it, for the error message. InputError if
+    the file is missing or lacks a column."""
     try:
         return pd.read_csv(path, usecols=list(columns))
     except FileNotFoundError:

@@ -19,13 +19,11 @@ USER, VIDEO = "user_id", "video_id"
 
 def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
     """Rows of a window of the logs, ordered by user and time, without repeated (user, video, time).
+    InputError if no row is in the window.
 
     Args:
         files: Parquet or CSV files with the same columns.
         where: SQL condition that selects the window.
-
-    Raises:
-        InputError: no row is in the window.
     """
     names = ", ".join(quote(glob_pattern(file)) for file in files)
     reader = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"

@@ -84,10 +84,8 @@ class Training:
     The logged sessions are its training sessions. After a uniform warm-up, it serves all N sessions
     with its current network and noise; the propensity is the density of the action. It learns from
     the live rows only, which are those that are logged. The value after the end of a session is 0,
-    whether it terminated or was truncated.
-
-    Raises:
-        InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
+    whether it terminated or was truncated. InputError if `env` is not a Taobao environment, or
+    Stable-Baselines3 is not installed.
     """
 
     def __init__(self, env: AnyEnv, seed: int, config: DdpgConfig = DEFAULT) -> None:
@@ -225,9 +223,7 @@ def snapshots(env: AnyEnv, seed: int, config: DdpgConfig) -> list[nn.Module]:
     They are trained at the first use and cached as safetensors in `$UCFREC_CACHE`
     (`~/.cache/ucfrec`). The file's name is a hash of responses of the environment, the
     configuration, the seed and the libraries' versions. No logged session is a training session.
-
-    Raises:
-        InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
+    InputError if `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """
     folder = Path(os.environ.get("UCFREC_CACHE", Path.home() / ".cache" / "ucfrec"))
     file = folder / f"ddpg-{_fingerprint(taobao(env), seed, config)}.safetensors"

@@ -158,7 +158,8 @@ def test_one_command_draws_what_it_can_and_names_the_rest(runs: Path, tmp_path: 
     rows = [result_row(1.0, metric="score", **about, conditions=each) for each in of]
     append_rows(results, rows)
     shutil.copytree(runs, copied)
-    write_run(copied / "tangent", {"store": str(tmp_path / "gone")})
+    record = copied / "tangent" / "run.json"
+    record.write_text(json.dumps(read_json(record) | {"store": str(tmp_path / "gone")}))
     command = ("figures", "--runs", copied, "--results", results, "--out", out)
     printed, said = control(*command)
     drawn = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
@@ -169,7 +170,3 @@ def test_one_command_draws_what_it_can_and_names_the_rest(runs: Path, tmp_path: 
     assert "missing: robustness: needs rows of `ucfrec-control robustness`" in said
     _, missing = make_figures([], [], out)
     assert {line.partition(":")[0] for line in missing} == set(NEEDS)
-
-
-def write_run(run: Path, entries: dict[str, object]) -> None:
-    (run / "run.json").write_text(json.dumps(read_json(run / "run.json") | entries))

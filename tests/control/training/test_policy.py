@@ -42,11 +42,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     file = write_hdf5(made / "pendulum.hdf5", arrays, env_id="Pendulum-v1")
     control("prepare", file, "--out", made / "store")
-    for name, policy, settings in (
-        ("ucf", "ucf", TINY),
-        ("bc", "bc", TINY[:3]),
-    ):
-        where = (made / "store", "--out", made / name, "--policy", policy)
+    for name, settings in (("ucf", TINY), ("bc", TINY[:3])):
+        where = (made / "store", "--out", made / name, "--policy", name)
         said = control("train", *where, *set_options(settings))[0]
         returns = np.add.reduceat(arrays["rewards"], np.arange(0, 960, 40))
         assert f"behaviour     mean return {returns.mean():.4g} of 24" in said
@@ -142,15 +139,11 @@ def test_the_return_is_estimated_with_reasons_against_it(folder: Path) -> None:
 def test_the_unit_of_the_actions_does_not_matter(folder: Path, tmp_path: Path) -> None:
     store = EpisodeStore.open(folder / "store")
     source = {"where": "here", "dataset": "small", "env_id": None, "versions": {}}
-    small = Trajectories(
-        store.column(schema.OBSERVATION),
-        store.column(schema.ACTION) / 1000,
-        store.column(schema.REWARD),
-        store.lengths,
-        store.terminated.astype(bool),
-        None,
-        source,
-    ).write_store(tmp_path / "store")
+    names = (schema.OBSERVATION, schema.ACTION, schema.REWARD)
+    seen, actions, rewards = (store.column(name) for name in names)
+    ends = store.lengths, store.terminated.astype(bool), None
+    trajectories = Trajectories(seen, actions / 1000, rewards, *ends, source)
+    small = trajectories.write_store(tmp_path / "store")
     losses = []
     for data in (store, small):
         policy = new_policy(data.split("train"), resolve_config("dt", None, TINY)).eval()

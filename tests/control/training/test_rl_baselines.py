@@ -29,11 +29,6 @@ pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
 pytest.importorskip("mujoco", reason="the extra control is not installed")
 
 
-@pytest.fixture(scope="module")
-def store(folder: Path) -> EpisodeStore:
-    return EpisodeStore.open(folder / "store")
-
-
 class _Stops:
     """Progress during whose fifth step the user interrupts."""
 

@@ -38,11 +38,6 @@ from ucfrec_control.training.train import find_preset, train_control
 LAST = ("--checkpoint", "last", "--episodes", "1")
 
 
-@pytest.fixture
-def store(folder: Path) -> EpisodeStore:
-    return EpisodeStore.open(folder / "store")
-
-
 def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> None:
     run, out = folder / "store-run", tmp_path / "rows.json"
     assert "warning" not in control("evaluate", run, "--episodes", 3, "--json", out)[1]

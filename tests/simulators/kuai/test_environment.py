@@ -1,5 +1,6 @@
 """The Kuaishou environments against a plain reading of their rules, one user at a time."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.kuai_reference import Plain
 from tests.support.played import play
 from tests.support.single_session import check_environment
 from ucfrec.acting.decision import DecisionRule
@@ -32,6 +32,25 @@ from ucfrec_simulators.kuai.logs import sessions_by_exit
 
 # Some published rules are equal.
 RULES = [replace(rule, sliced=s) for rule in dict.fromkeys(EXITS.values()) for s in (False, True)]
+
+
+class Plain:
+    """One session as the published code simulates it, its slices included."""
+
+    def __init__(self, tags: list[tuple[int, ...]], rule: ExitRule) -> None:
+        self.tags, self.rule, self.shown = tags, rule, list[int]()
+
+    def step(self, item: int) -> tuple[bool, bool]:
+        """Whether the user leaves by the rule, and whether the session is over."""
+        t, rule = len(self.shown), self.rule
+        first = t - rule.window if rule.sliced else max(0, t - rule.window)
+        pooled = Counter(tag for shown in self.shown[first:t] for tag in self._of(shown))
+        self.shown.append(item)
+        bored = t > 0 and any(pooled[tag] > rule.threshold for tag in self._of(item))
+        return bored, bored or t >= rule.max_turn - 1
+
+    def _of(self, item: int) -> tuple[int, ...]:
+        return self.tags[item] or (-1,)
 
 
 @st.composite

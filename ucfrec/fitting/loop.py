@@ -55,8 +55,8 @@ class LoopConfig:
     validate_every: Count = 200
     """Steps between validations, checkpoints and log lines."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Numbers in which the policy's products are computed; `bfloat16` is for GPUs. Weights, losses
-    and optimizer are float32 with both."""
+    """Numbers in which the policy's products are computed; `bfloat16` is for GPUs and for CPUs with
+    avx512_bf16 or AMX. Weights, losses and optimizer are float32 with both."""
     patience: Annotated[int, Field(ge=0, le=10**9)] = 5
     """Number of consecutive validations without improvement after which training stops early; 0
     disables early stopping."""

@@ -30,6 +30,7 @@ from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.commands.cli import main
+from ucfrec.episodes.offers import Offers
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
@@ -51,6 +52,8 @@ from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
 
+HOUR, DAY = 3_600_000, 86_400_000
+
 onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
@@ -65,7 +68,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
 
 
 def ranked(
-    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping
+    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping, at: int | None
 ) -> pd.DataFrame:
     """What the graph recommends, from the log and the description alone."""
     description = json.loads((folder / DESCRIPTION).read_text())
@@ -91,6 +94,8 @@ def ranked(
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
                 rows["observations"].append([batch.observations[number]] * context)
+            if "times" in rows:
+                rows["times"].append(at)
             users.append(user)
     dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
     given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
@@ -106,12 +111,17 @@ def ranked(
 
 
 def agree(
-    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping, rule: DecisionRule
+    folder: Path,
+    trained: TrainedPolicy,
+    log: pd.DataFrame,
+    mapping: LogMapping,
+    rule: DecisionRule,
+    at: int | None = None,
 ) -> None:
     """The graph recommends what the policy does."""
     batches = histories_of_frame(trained, log, mapping)
-    expected = pd.concat(recommend(trained, batches, 20, rule=rule), ignore_index=True)
-    found = ranked(folder, trained, log, mapping)
+    expected = pd.concat(recommend(trained, batches, 20, rule=rule, at=at), ignore_index=True)
+    found = ranked(folder, trained, log, mapping, at)
     expected = expected[[*found.columns]]  # a graph says nothing of draws
     pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
 
@@ -140,6 +150,23 @@ def test_a_graph_has_observations(observing: TrainedPolicy, tmp_path: Path) -> N
     rule = DecisionRule(3.0, 1.0, reward_weight=0.7)
     export(observing, tmp_path / "out", rule=rule, k=20)
     agree(tmp_path / "out", observing, observed_log(histories()), OBSERVED, rule)
+
+
+@pytest.mark.parametrize("rule", [DecisionRule(3.0, reward_weight=2.0), AHEAD])
+def test_a_graph_knows_what_is_on_offer_and_how_old(
+    ending: TrainedPolicy, tmp_path: Path, rule: DecisionRule
+) -> None:
+    log, n, model = histories(), np.arange(24), copy.deepcopy(ending.reward_model)
+    end, weights = int(log.timestamp.max()), torch.tensor([0.5, -0.3, 0.2, 0.4, -0.1, 0.3])
+    model.running, model.latest = nn.Buffer(weights), nn.Buffer(torch.randn(4, 24))
+    # The first five return later.
+    intervals = np.stack([n, end - n * DAY, end + n * HOUR])[:, 1:]
+    again = np.stack([n, n + end + 30 * HOUR, n + end + 90 * HOUR])[:, 1:6]
+    offers = Offers.of(24, np.hstack([intervals, again]), np.zeros((2, 0), np.int64))
+    given = replace(ending, reward_model=model, offers=offers)
+    export(given, tmp_path / "out", rule=rule, k=20)
+    for at in (end + 6 * HOUR, end + 12 * HOUR, end + 40 * HOUR):
+        agree(tmp_path / "out", given, log, LogMapping(), rule, at)
 
 
 @pytest.fixture

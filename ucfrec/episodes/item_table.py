@@ -27,9 +27,6 @@ WINDOW = 10
 DECAY = 0.8
 """Factor by which the weight in the means falls with each step back."""
 
-_SPARSE = 4
-"""Range of integers, relative to their number, up to which a table holds all of the range."""
-
 
 def write_item_table(
     path: Path,
@@ -75,13 +72,14 @@ class IdLookup:
         """
         self.ids = ids
         self._whole = np.can_cast(ids.dtype, np.int64)
-        self._order = np.argsort(ids, kind="stable") if self._whole else np.empty(0, np.int64)
-        self._sorted = ids[self._order]
-        low, high = map(int, self._sorted[[0, -1]]) if len(self._sorted) else (0, 0)
-        self._low, self._places = low, np.empty(0, np.int64)
-        if high - low < _SPARSE * len(self._sorted):
-            self._places = np.full(high - low + 1, -1)
-            self._places[ids - low] = np.arange(len(ids))
+        self._low, high = (int(ids.min()), int(ids.max())) if self._whole and len(ids) else (0, -1)
+        self._dense = self._whole and high - self._low < 4 * len(ids)  # of others, a table is large
+        if self._dense:
+            self._order = np.full(high - self._low + 1, -1)
+            self._order[ids.astype(np.int64) - self._low] = np.arange(len(ids))
+        elif self._whole:
+            self._order = np.argsort(ids, kind="stable")
+            self._sorted = ids[self._order]
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -91,11 +89,10 @@ class IdLookup:
         if not (len(ids) and len(self.ids)):
             return np.full(len(ids), -1)
         if self._whole and np.can_cast(ids.dtype, np.int64):
-            if len(self._places):
-                places = ids - self._low  # Beyond 64 bits it wraps around, out of the table.
-                listed = (places >= 0) & (places < len(self._places))
-                return np.where(listed, self._places.take(places, mode="clip"), -1)
-            # One search costs less than a hash table for as few as a request has.
+            if self._dense:
+                numbers = self._order.take(ids.astype(np.int64) - self._low, mode="clip")
+                return np.where(self.ids[numbers] == ids, numbers, -1)
+            # One search costs less than a table for as few as a request has.
             places = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
             return np.where(self._sorted[places] == ids, self._order[places], -1)
         table = self._of_text

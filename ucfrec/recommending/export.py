@@ -48,8 +48,8 @@ _MEANINGS = {
     "steps": "number of items that the session has shown",
     "collected": "sum of the rewards of the session",
     "users": "index of the user in user_ids; -1 for others",
-    _TIMES: "time of the request, milliseconds since 1970: items that are not available then are left "
-    "out, and the reward model counts how old they are",
+    _TIMES: "time of the request in ms since 1970: items not available then are left out, and the "
+    "reward model counts how old they are",
     _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "
     "column",
     "observations": "of the last steps, the one to decide included; `ucfrec recommend` repeats the "
@@ -100,7 +100,8 @@ def export(
             scores differ from torch's, or `out` exists.
     """
     require_installed()
-    graph = RuleGraph(trained.item_scorer(rule), trained.name, k, trained.offers).eval()
+    graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
+    graph.offers = trained.offers
     if graph.scorer.list_term is not None:
         raise InputError(
             f"{trained.folder}: the rule builds lists by marginal gain, which a graph cannot; "
@@ -129,12 +130,13 @@ def export(
 class _Network(nn.Module):
     """A scorer as a module, with its weights; InputError if the policy has no vectors of items."""
 
+    offers: Offers | None = None
+
     def __init__(
         self,
         scorer: Scorer,
         kind: str,
         remedy: str,
-        offers: Offers | None = None,
     ) -> None:
         super().__init__()
         if not scorer.has_factors:
@@ -142,7 +144,7 @@ class _Network(nn.Module):
                 f"policies of kind {kind!r} score items in a way of their own, which {remedy}"
             )
         models = (scorer.policy, scorer.reward_model)
-        self.scorer, self.offers = scorer, offers
+        self.scorer = scorer
         self._models = nn.ModuleList(model for model in models if model is not None)
 
     def forward(self, *inputs: Tensor) -> Any:
@@ -162,14 +164,12 @@ class RuleGraph(_Network):
         scorer: Scorer,
         kind: str,
         k: int | None,
-        offers: Offers | None,
     ) -> None:
         assert scorer.states is not None
         super().__init__(
             scorer,
             kind,
             "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc",
-            offers,
         )
         self._items = len(scorer.states.embeddings)
         self._k = min(_DEFAULT_K, self._items) if k is None else k

@@ -365,6 +365,6 @@ def _read_times(rows: Sequence[Row]) -> list[int]:
 def id_array(ids: Sequence[int | str]) -> Array:
     """Identifiers as int64 if all are integers of 64 bits, otherwise as text."""
     try:
-        return np.asarray(array("q", ids), dtype=np.int64)  # type: ignore[arg-type]
+        return np.asarray(array("q", ids), dtype=np.int64)  # type: ignore[type-var]
     except (TypeError, OverflowError):
         return np.asarray(list(map(str, ids)), dtype=object)

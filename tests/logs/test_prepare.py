@@ -149,6 +149,7 @@ def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     stores = [EpisodeStore.open(tmp_path / kind).record for kind in ("csv", "parquet")]
     assert stores[0].fingerprint == stores[1].fingerprint
     assert stores[0].source.mapping == {"user_id": "uid", "timestamp": "when"}
+    assert stores[0].source.decisions == len(log[["uid", "when"]].drop_duplicates())
     assert steps_of(tmp_path / "csv")["user_id"].str.startswith("u").all()
 
 

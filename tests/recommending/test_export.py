@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.recommending.test_responder import answered
+from tests.recommending.test_responder import answered, recommended
 from tests.support.logs import store_of
 from tests.support.served import (
     FULL,
@@ -30,6 +30,7 @@ from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.commands.cli import main
+from ucfrec.episodes.offers import Offers
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
@@ -47,7 +48,6 @@ from ucfrec.recommending.export import (
     write_graph,
 )
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -64,9 +64,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     return TrainedPolicy.load(folder / "run")
 
 
-def ranked(
-    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping
-) -> pd.DataFrame:
+def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame, at: int | None) -> pd.DataFrame:
     """What the graph recommends, from the log and the description alone."""
     description = json.loads((folder / DESCRIPTION).read_text())
     length = next(i["shape"][1] for i in description["inputs"] if i["name"] == "items")
@@ -75,6 +73,7 @@ def ranked(
     user_of = {user: n for n, user in enumerate(description["user_ids"])}
     rows: dict[str, list[Any]] = {entry["name"]: [] for entry in description["inputs"]}
     users = []
+    mapping = OBSERVED if "observation" in log else LogMapping()
     for batch in histories_of_frame(trained, log, mapping):
         latest = batch.latest_session(description["session_gap_ms"])
         for number, user in enumerate(batch.users):
@@ -91,6 +90,7 @@ def ranked(
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
                 rows["observations"].append([batch.observations[number]] * context)
+            rows.get("times", []).append(at)
             users.append(user)
     dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
     given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
@@ -106,12 +106,11 @@ def ranked(
 
 
 def agree(
-    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping, rule: DecisionRule
+    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, rule: DecisionRule, at: Any = None
 ) -> None:
     """The graph recommends what the policy does."""
-    batches = histories_of_frame(trained, log, mapping)
-    expected = pd.concat(recommend(trained, batches, 20, rule=rule), ignore_index=True)
-    found = ranked(folder, trained, log, mapping)
+    expected = recommended(trained, log, 20, rule=rule, at=at)
+    found = ranked(folder, trained, log, at)
     expected = expected[[*found.columns]]  # a graph says nothing of draws
     pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
 
@@ -133,13 +132,26 @@ def test_the_graph_recommends_what_the_policy_does(
     assert export(given, tmp_path / "out", rule=rule, k=20).difference <= 1e-5
     log = histories()
     for some in (log, log[log.user_id == log.user_id.min()]):
-        agree(tmp_path / "out", given, some, LogMapping(), rule)
+        agree(tmp_path / "out", given, some, rule)
 
 
 def test_a_graph_has_observations(observing: TrainedPolicy, tmp_path: Path) -> None:
     rule = DecisionRule(3.0, 1.0, reward_weight=0.7)
     export(observing, tmp_path / "out", rule=rule, k=20)
-    agree(tmp_path / "out", observing, observed_log(histories()), OBSERVED, rule)
+    agree(tmp_path / "out", observing, observed_log(histories()), rule)
+
+
+def test_a_graph_knows_what_is_on_offer_and_how_old(ending: TrainedPolicy, tmp_path: Path) -> None:
+    log, n, model = histories(), np.arange(1, 24), copy.deepcopy(ending.reward_model)
+    model.running, model.latest = nn.Buffer(torch.linspace(-1, 1, 6)), nn.Buffer(torch.randn(4, 24))
+    end, hour = int(log.timestamp.max()), 3_600_000
+    once, again = np.stack([n, end - 24 * n * hour, end + n * hour]), np.stack([n, n, n])[:, :5]
+    again[1:] += np.array([[30], [90]]) * hour + end  # the first five return
+    offers = Offers.of(24, np.hstack([once, again]), np.zeros((2, 0), np.int64))
+    given = replace(ending, reward_model=model, offers=offers)
+    export(given, tmp_path / "out", rule=AHEAD, k=20)
+    for hours in (6, 12, 40):
+        agree(tmp_path / "out", given, log, AHEAD, end + hours * hour)
 
 
 @pytest.fixture
@@ -166,7 +178,7 @@ def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None
     # Alone, a session has less padding before it than in a graph or beside a longer session.
     for users in (log.user_id.unique(), *([user] for user in log.user_id.unique()[:3])):
         some = log[log.user_id.isin(users)].groupby("user_id").tail(3)
-        agree(tmp_path / "out", given, some, LogMapping(), rule)
+        agree(tmp_path / "out", given, some, rule)
 
 
 def test_the_command_writes_it_whole_or_not_at_all(

@@ -105,6 +105,13 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
+@given(ids=st.lists(st.integers(-9, 30) | st.sampled_from([-(2**63), 2**63 - 1, "3", "99"])))
+def test_candidates_are_a_set_of_ids(trained: TrainedPolicy, ids: list[int | str]) -> None:
+    by = responder(trained, k=24, filter_seen=False, skip_unknown=True)
+    every, some = by.answers([Request(user_id=1), Request(user_id=1, candidates=[*ids, 5])])
+    assert some.items == [item for item in every.items if item in {*map(int, ids), 5}]
+
+
 def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
     log, by = histories(users=6), responder(trained, k=24)
     asked = [{**each, "new_session": n % 2 == 0} for n, each in enumerate(requests_of(log))]

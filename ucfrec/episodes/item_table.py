@@ -54,8 +54,14 @@ class IdLookup:
         """
         self.ids = ids
         self._whole = np.can_cast(ids.dtype, np.int64)
-        self._order = np.argsort(ids, kind="stable") if self._whole else np.empty(0, np.int64)
-        self._sorted = ids[self._order]
+        self._low, high = (int(ids.min()), int(ids.max())) if self._whole and len(ids) else (0, -1)
+        self._dense = self._whole and high - self._low < 4 * len(ids)  # of others, a table is large
+        if self._dense:
+            self._order = np.full(high - self._low + 1, -1)
+            self._order[ids.astype(np.int64) - self._low] = np.arange(len(ids))
+        elif self._whole:
+            self._order = np.argsort(ids, kind="stable")
+            self._sorted = ids[self._order]
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -65,6 +71,9 @@ class IdLookup:
         if not (len(ids) and len(self.ids)):
             return np.full(len(ids), -1)
         if self._whole and np.can_cast(ids.dtype, np.int64):
+            if self._dense:
+                numbers = self._order.take(ids.astype(np.int64) - self._low, mode="clip")
+                return np.where(self.ids[numbers] == ids, numbers, -1)
             # One search costs less than a table for as few as a request has.
             places = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
             return np.where(self._sorted[places] == ids, self._order[places], -1)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_table import ALWAYS
@@ -133,12 +134,12 @@ class Offer:
             begin, end = begin[items], end[items]
         offered = (begin <= times) & (times < end)
         item, begin, end = offers.later
-        columns = item if items is None else columns_of(item, items)
-        some = columns >= 0
-        if bool(some.any()):
-            again = (begin[some] <= times) & (times < end[some])
-            counts = offered.int().index_add_(1, columns[some], again.int())
-            offered = counts > 0
+        if len(item):
+            columns = item if items is None else columns_of(item, items)
+            columns = torch.where(columns < 0, offered.shape[1], columns).expand(times.shape[0], -1)
+            again = ((begin <= times) & (times < end)).int()
+            counts = F.pad(offered.int(), (0, 1)).scatter_add(1, columns, again)
+            offered = counts[:, :-1] > 0
         if self.sets is not None:
             numbers, rows = torch.unique(self.sets, return_inverse=True)
             offered &= self._members(numbers, items)[rows]

@@ -55,6 +55,7 @@ class Source(Entry):
     equal_times: Count | None = None
     """Rows at the time of another row of their user, in no order that could be learned."""
     steps: Count | None = None
+    decisions: Count | None = None
     users: Count | None = None
     items: Count | None = None
     sessions: Count | None = None

@@ -408,6 +408,7 @@ def _merge_records(
         "rows_read": (old.source.rows_read or 0) + report["rows_read"],
         "dropped": dropped,
         "steps": steps + new.n_steps,
+        "decisions": None,
         "time_range_ms": [min(times), max(times)],
         "split_times_ms": report["split_times_ms"],
         **origin,

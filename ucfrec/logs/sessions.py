@@ -197,6 +197,7 @@ class StepCounts:
     item_train_steps: IntArray
     """(items,) number of steps, and of training steps, that show each item, by code."""
     steps: int = 0
+    decisions: int = 0
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
     rewards: Moments = field(default_factory=lambda: Moments(1))
@@ -220,6 +221,7 @@ class StepCounts:
         if not len(times):
             return
         self.steps += len(times)
+        self.decisions += int(np.count_nonzero(episodes.rows[schema.PLACE] == 0))
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)

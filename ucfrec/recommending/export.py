@@ -6,6 +6,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import redirect_stdout
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array
+from ucfrec.episodes.item_table import ALWAYS
+from ucfrec.episodes.offers import Offers
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_folder, write_json
@@ -31,7 +34,7 @@ TOLERANCE = 1e-5
 """
 _STATE = ("items", "rewards", "steps", "collected", "users", "observations")
 """Inputs: the first fields of `Sessions`, of which `items` are the actions."""
-_EXCLUDED = "excluded"
+_TIMES, _EXCLUDED = "times", "excluded"
 _OPSET = 20
 _DEFAULT_K = 100
 _COMPARED = 16
@@ -45,6 +48,8 @@ _MEANINGS = {
     "steps": "number of items that the session has shown",
     "collected": "sum of the rewards of the session",
     "users": "index of the user in user_ids; -1 for others",
+    _TIMES: "time of the request in ms since 1970: items not available then are left out, and the "
+    "reward model counts how old they are",
     _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "
     "column",
     "observations": "of the last steps, the one to decide included; `ucfrec recommend` repeats the "
@@ -57,7 +62,7 @@ _MEANINGS = {
 }
 _NOTES = (
     "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
-    "and tag_run; put into `excluded` what is not available and, with exclude_seen, the session's "
+    "and tag_run; put into `excluded` what is not in stock and, with exclude_seen, the session's "
     "items; with a temperature, draw from `scores` divided by it, with top_k among so many best; "
     "with explore, draw that share of the requests uniformly, with explore_top among so many best; "
     "by_marginal_gain changes nothing, as the reward model has no effect of items above others"
@@ -96,18 +101,13 @@ def export(
     """
     require_installed()
     graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
-    model = graph.scorer.reward_model
+    graph.offers = trained.offers
     if graph.scorer.list_term is not None:
         raise InputError(
             f"{trained.folder}: the rule builds lists by marginal gain, which a graph cannot; "
             f"{_SERVE}, or export a rule without"
         )
-    if graph.scorer.rule.reward_weight and model is not None and model.running.any():
-        raise InputError(
-            f"{trained.folder}: scores depend on the time of the request, as items come and go; "
-            f"{_SERVE}, or export a rule with reward weight 0"
-        )
-    example = _draw_inputs(graph.scorer, 3, seed=0)
+    example = _draw_inputs(graph, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: list[dict[int, Any]] = [{0: batch} for _ in example]
     shapes[-1][1] = torch.export.Dim("excluded_items", min=1, max=2**24)
@@ -117,7 +117,7 @@ def export(
         write_graph(graph, example, path, list(OUTPUTS), trained.name, _SERVE, sizes)
         runner = start_runner(path)
         for sessions in (_COMPARED, 1):
-            example = _draw_inputs(graph.scorer, sessions, seed=sessions)
+            example = _draw_inputs(graph, sessions, seed=sessions)
             difference = max(difference, _measure_difference(graph, runner, example, _SERVE))
         files = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
         with torch.no_grad():
@@ -129,6 +129,8 @@ def export(
 
 class _Network(nn.Module):
     """A scorer as a module, with its weights; InputError if the policy has no vectors of items."""
+
+    offers: Offers | None = None
 
     def __init__(
         self,
@@ -146,9 +148,11 @@ class _Network(nn.Module):
         self._models = nn.ModuleList(model for model in models if model is not None)
 
     def forward(self, *inputs: Tensor) -> Any:
-        """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
+        """Scores; the inputs are the fields of `Sessions`, times where there are offers, and last
+        what may not be shown."""
         *session, excluded = inputs
-        sessions = Sessions(*session)  # type: ignore[arg-type]
+        offer = None if self.offers is None else self.offers.at(session.pop())
+        sessions = replace(Sessions(*session), offer=offer)  # type: ignore[arg-type]
         return (self.scorer.scores(sessions, excluded=excluded, empty=True),)
 
 
@@ -178,7 +182,7 @@ class RuleGraph(_Network):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scores (B, n_items), the k best items (B, k) and their log-probabilities (B, k).
 
-        The inputs are the fields of `Sessions`, and last the items excluded (B, E), padded with −1.
+        The inputs are those of a network, but last the items excluded (B, E), padded with −1.
         """
         *session, excluded = inputs
         places = torch.where(excluded < 0, self._items, excluded)
@@ -211,13 +215,13 @@ def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Te
     if scorer.rule.looks_ahead and model is not None and model.running.any():
         raise InputError(f"a lookahead depends on the time, as items come and go; {_TORCH}")
     network = _Network(scorer, kind, f"onnxruntime cannot compute; {_TORCH}").eval()
-    example = _draw_inputs(scorer, 1, seed=0, mask=True)
+    example = _draw_inputs(network, 1, seed=0, mask=True)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / GRAPH
         write_graph(network, example, path, ["scores"], kind, _TORCH)
         runner = start_runner(path)
     for number in range(1, 1 + _COMPARED):
-        example = _draw_inputs(scorer, 1, seed=number, mask=True)
+        example = _draw_inputs(network, 1, seed=number, mask=True)
         _measure_difference(network, runner, example, _TORCH)
 
     def score(session: Sessions, excluded: Tensor) -> Tensor:
@@ -229,14 +233,15 @@ def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Te
 
 
 def _draw_inputs(
-    scorer: Scorer,
+    network: _Network,
     sessions: int,
     seed: int,
     mask: bool = False,
 ) -> dict[str, Tensor]:
     """Random inputs of a graph, of sessions of at most twice as many steps as the scorer reads; the
     items excluded are numbers, or a `mask` of all items."""
-    states, length, rng = scorer.states, scorer.length, np.random.default_rng(seed)
+    scorer, rng = network.scorer, np.random.default_rng(seed)
+    states, length = scorer.states, scorer.length
     assert states is not None
     n = len(states.embeddings)
     steps = rng.integers(0, 2 * length + 1, size=sessions)
@@ -253,6 +258,9 @@ def _draw_inputs(
     if observed := scorer.policy.state_mean.shape[0] - states.size:
         size = (sessions, scorer.policy.config.context, observed)
         arrays["observations"] = rng.normal(size=size).astype(np.float32)
+    if network.offers is not None:
+        bounds = np.append(network.offers.intervals[1:], 0)
+        arrays[_TIMES] = rng.choice(bounds[abs(bounds) < ALWAYS[1]], size=sessions)
     if mask:
         arrays[_EXCLUDED] = rng.random((sessions, n)) < rng.uniform(0, _MOST_EXCLUDED)
     else:

@@ -145,7 +145,7 @@ class ExposureLog:
         self._thread.start()
 
     def add(self, user_id: int | str, answer: "Answer") -> None:
-        """Remember an answer that is given now; takes microseconds, or a fifth of a millisecond for
+        """Remember an answer that is given now; takes microseconds, or a tenth of a millisecond for
         a thousand candidates."""
         now, size = int(self._clock() * 1000), len(answer.items)
         candidates = name_set(answer.candidates)

@@ -312,7 +312,7 @@ def _refuse_unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError
 
 def name_some(values: Sequence[Any]) -> str:
     """The first of the values, for a message."""
-    return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
+    return ", ".join(f"{v!s:.60}" for v in values[:3]) + (", …" if len(values) > 3 else "")
 
 
 def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Sessions:

@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
@@ -47,7 +48,7 @@ _EARLIEST_MS = 365 * DAY_MS
 _LARGEST_FLOAT = float(np.finfo(np.float32).max)
 _MOST_FAULTS = 1000
 """Beyond this number, it would take too long to look at each."""
-_TYPES = ("constrained-str", "float", "constrained-int")
+_TYPES = ("constrained-str", "float", "constrained-int", "int", "str")
 """Last part of pydantic's place of an error in one of several types."""
 _ROWS = "history"
 """Name of the rows in messages and in the engine."""
@@ -122,7 +123,8 @@ class Request(BaseModel):
     """The user's interactions, in any order; empty for a new user."""
     k: Annotated[int, Field(ge=1)] | None = None
     """Number of items."""
-    candidates: Annotated[list[Id], Field(min_length=1, fail_fast=True)] | None = None
+    # Not `Id`, as checking the range of every one takes as long as reading it.
+    candidates: Annotated[list[int | str], Field(min_length=1, fail_fast=True)] | None = None
     """The only items to recommend."""
     new_session: bool = False
     """Whether the user begins a new session. Otherwise the latest one of the history goes on."""
@@ -361,7 +363,8 @@ def _read_times(rows: Sequence[Row]) -> list[int]:
 
 
 def id_array(ids: Sequence[int | str]) -> Array:
-    """Identifiers as int64 if all are integers, otherwise as text."""
-    if {*map(type, ids)} <= {int}:
-        return np.asarray(ids, dtype=np.int64)
-    return np.asarray(list(map(str, ids)), dtype=object)
+    """Identifiers as int64 if all are integers of 64 bits, otherwise as text."""
+    try:
+        return np.asarray(array("q", ids), dtype=np.int64)  # type: ignore[type-var]
+    except (TypeError, OverflowError):
+        return np.asarray(list(map(str, ids)), dtype=object)

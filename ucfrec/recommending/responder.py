@@ -205,7 +205,7 @@ class Responder:
                 )
             if request.candidates is not None:
                 ids = id_array(request.candidates)
-                candidates = candidate_numbers(items, ids, self._skip_unknown)
+                candidates = np.sort(candidate_numbers(items, ids, self._skip_unknown))
         except InputError as error:
             return error
         k = self._k if request.k is None else request.k

@@ -107,10 +107,11 @@ class RunningRates:
 
     def sum_all(self, offer: Offer, weights: Tensor) -> Tensor:
         """(M, n_items) the inputs of all items times `weights` (H + `AGES`,)."""
+        ages = _ages(offer.times.unsqueeze(1), offer.offers.begin) @ weights[-AGES:]
+        if not self.bins.number:  # also in graphs that are exported
+            return torch.einsum("thn,h->tn", self.rates, weights[:-AGES]) + ages
         distinct, rows = torch.unique(self.bins.rows(offer.times), return_inverse=True)
-        of_rates = torch.einsum("thn,h->tn", self.rates[distinct], weights[:-AGES])
-        ages = _ages(offer.times.unsqueeze(1), offer.offers.begin)
-        return of_rates[rows] + ages @ weights[-AGES:]
+        return torch.einsum("thn,h->tn", self.rates[distinct], weights[:-AGES])[rows] + ages
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,6 @@ def fit_mixture(shares: Float64Array, later: Float64Array) -> Float64Array:
 
 def _ages(times: Tensor, begin: Tensor) -> Tensor:
     """(..., `AGES`) of items at times (...), which are available from `begin` (...), in ms."""
-    days = ((times - begin) / (24 * _HOUR_MS)).clamp(0, _OLDEST).float()
+    days = ((times - begin) / (24 * _HOUR_MS)).clamp(0.0, _OLDEST).float()
     days = torch.where(begin == ALWAYS[0], 0.0, days)
     return torch.stack([days, torch.log1p(24 * days)], dim=-1)

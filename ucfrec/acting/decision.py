@@ -217,7 +217,8 @@ class DecisionRule:
             return best_items(scores, k), torch.ones(len(scores), k, dtype=torch.float64)
         assert uniforms is not None
         modes = self._modes(scores)
-        if len(modes) > 1 or int((modes[0][1] > -torch.inf).sum(1).min()) < k:
+        drawable = (modes[0][1] > -torch.inf).sum(1)
+        if len(modes) > 1 or int(drawable.min()) < k:
             modes = self._follow_best(modes, scores)
         logs = modes[0][1].double()
         if len(modes) > 1:
@@ -254,7 +255,8 @@ class DecisionRule:
             turns.add(items, modes)
             ranked.append(items)
             totals.append(turns.joint.logsumexp(0))
-        return torch.stack(ranked, 1), torch.stack(totals, 1).diff(dim=1).exp().clamp(max=1.0)
+        log_propensities = torch.stack(totals, 1).diff(dim=1)
+        return torch.stack(ranked, 1), log_propensities.exp().clamp(max=1.0)
 
     def _modes(self, scores: Tensor) -> list[tuple[float, Tensor]]:
         """Ways in which a request may be answered: its share, and log-probabilities (B, n_items) of
@@ -284,7 +286,8 @@ class _Turns:
         self._rule, self._scores, self._term = rule, scores, term
         self._taken = torch.zeros_like(scores, dtype=torch.bool)
         shares = [share for share in (1 - rule.explore, rule.explore) if share > 0]
-        self.joint = torch.tensor(shares).double().log().unsqueeze(1).expand(-1, len(scores))
+        log_shares = torch.tensor(shares).double().log()
+        self.joint = log_shares.unsqueeze(1).expand(-1, len(scores))
         """(M, B) log-probabilities of the items so far, and of being answered in each mode."""
 
     def next(self) -> Tensor:
@@ -332,7 +335,8 @@ def _conditional(logs: Tensor, items: Tensor) -> Tensor:
     of_items = logs.gather(1, items)
     remainder = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
     # What is left before each draw is summed from the end, so that nothing cancels.
-    left = torch.cat([remainder, of_items.flip(1)], dim=1).logcumsumexp(1).flip(1)[:, :-1]
+    from_last = torch.cat([remainder, of_items.flip(1)], dim=1)
+    left = from_last.logcumsumexp(1).flip(1)[:, :-1]
     return (of_items - left).clamp(max=0.0)
 
 
@@ -348,7 +352,8 @@ def best_items(scores: Tensor, k: int) -> Tensor:
     if k == 1:
         return _best(scores).unsqueeze(1)
     values, numbers = _some_best(scores, min(k + 1, scores.shape[1]))
-    for row in (values[:, 1:] == values[:, :-1]).any(1).nonzero()[:, 0].tolist():
+    ties = values[:, 1:] == values[:, :-1]
+    for row in ties.any(1).nonzero()[:, 0].tolist():
         of_row, last = scores[row].numpy(), values[row, k - 1].item()
         above = np.flatnonzero(of_row > last)
         best = np.append(above, np.flatnonzero(of_row == last)[: k - len(above)])

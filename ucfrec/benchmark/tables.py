@@ -74,13 +74,15 @@ def distractor_table(rows: Sequence[ResultRow]) -> str:
     )
     lines = []
     # Environments together, the largest target first; methods stay in their order.
-    for (environment, quantile, method), group in sorted(groups.items(), key=lambda g: g[0][:2]):
+    by_target = sorted(groups.items(), key=lambda group: group[0][:2])
+    for (environment, quantile, method), group in by_target:
         by_rate = grouped(group, lambda row: row.conditions["distractor"])
         indexed = [index_by_seeds(by_rate.get(r, ())) for r in DISTRACTOR_RATES.values()]
         pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
         if not pairs:  # an environment in which no distractor was planted
             continue
-        indexed.append({pair: 100 * (1 - indexed[1][pair] / indexed[0][pair]) for pair in pairs})
+        clean, distracted = indexed[:2]
+        indexed.append({pair: 100 * (1 - distracted[pair] / clean[pair]) for pair in pairs})
         spread = [mean_and_sd(values[pair] for pair in pairs) for values in indexed]
         lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
     head = ("environment", "target quantile", "method", "logs × seeds")

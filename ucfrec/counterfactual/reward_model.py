@@ -411,7 +411,8 @@ def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CR
     kl = q.kl.mean(dim=0)
     active = kl > _ACTIVE_NATS
     columns = torch.cat([without_z.unsqueeze(1), q.mean[:, active]], dim=1)
-    leak = torch.corrcoef(columns.T).nan_to_num().abs().reshape(columns.shape[1], -1)[0, 1:]
+    correlations = torch.corrcoef(columns.T).nan_to_num().abs()
+    leak = correlations.reshape(columns.shape[1], -1)[0, 1:]
     errors = (with_z - r).abs().double()
     report = CRMReport(
         train_transitions=n_train,

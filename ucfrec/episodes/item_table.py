@@ -54,7 +54,9 @@ class IdLookup:
         """
         self.ids = ids
         self._whole = np.can_cast(ids.dtype, np.int64)
-        self._low, high = (int(ids.min()), int(ids.max())) if self._whole and len(ids) else (0, -1)
+        self._low, high = 0, -1
+        if self._whole and len(ids):
+            self._low, high = int(ids.min()), int(ids.max())
         self._dense = self._whole and high - self._low < 4 * len(ids)  # of others, a table is large
         if self._dense:
             self._order = np.full(high - self._low + 1, -1)

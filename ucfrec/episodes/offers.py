@@ -81,7 +81,8 @@ class Offers:
             for items in (offers.later[0], offers.sets[1]):
                 if bool(((items < 0) | (items >= n_items)).any()):
                     raise ValueError(f"it has items beyond the {n_items}")
-            if bool((offers.later[0].diff() < 0).any() | (offers.pairs.diff() <= 0).any()):
+            unsorted = (offers.later[0].diff() < 0).any()
+            if bool(unsorted | (offers.pairs.diff() <= 0).any()):
                 raise ValueError("its items are not in order")
             return offers
 

@@ -158,7 +158,8 @@ class EpisodeStore(EpisodeView):
         if not self.has_users or not len(self):
             return numbers
         users, splits = (self.episode_values(n).astype(int) for n in (schema.USER, schema.SPLIT))
-        goes_on = (np.diff(users) == 0) & (np.diff(splits) > 0) & (np.diff(numbers) == 1)
+        same_user = (np.diff(users) == 0) & (np.diff(numbers) == 1)
+        goes_on = same_user & (np.diff(splits) > 0)
         first = np.append(True, ~goes_on | self.terminated[:-1])
         return np.asarray(numbers[first][np.cumsum(first) - 1])
 

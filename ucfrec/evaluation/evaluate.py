@@ -221,5 +221,6 @@ def _read_incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
     column = table[TAGS].combine_chunks()
     tag_ids, places = np.unique(np.asarray(column.flatten()), return_inverse=True)
     incidence = np.zeros((len(column), len(tag_ids)), dtype=np.bool_)
-    incidence[np.repeat(np.arange(len(column)), np.diff(np.asarray(column.offsets))), places] = True
+    items = np.repeat(np.arange(len(column)), np.diff(np.asarray(column.offsets)))
+    incidence[items, places] = True
     return incidence

@@ -176,7 +176,8 @@ def _acquire(file: Path, seconds: float) -> BaseFileLock | None:
     lock = FileLock(file, thread_local=False, poll_interval=0.01)
     try:
         lock.acquire(timeout=seconds)
-        command = " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])[:_COMMAND_LENGTH]
+        program = Path(sys.argv[0] or "python").name
+        command = " ".join([program, *sys.argv[1:]])[:_COMMAND_LENGTH]
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
         # On Windows no one else can read the first byte, which is what is locked.

@@ -97,7 +97,8 @@ class _ConvBlock(nn.Module):
         # Each modality has its own filter: taps (kernel, 3K, d), bias (3K, d).
         steps = hidden.shape[1] // 3
         filters: list[Tensor] = [*self.mixers.parameters()]  # a weight and a bias of each modality
-        taps, bias = torch.cat(filters[::2], 1).permute(2, 1, 0), torch.stack(filters[1::2])
+        taps = torch.cat(filters[::2], 1).permute(2, 1, 0)
+        bias = torch.stack(filters[1::2])
         mixed = sum_shifted(normed, taps.repeat(1, steps, 1), bias.repeat(steps, 1))
         hidden = (hidden + mixed)[:, rows]
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]

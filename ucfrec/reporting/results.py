@@ -204,7 +204,10 @@ def _compare(metric: str, rows: Sequence[ResultRow]) -> str:
     if math.isfinite(best.low):
         text += f" 95% intervals {format_value(best.low)} to {format_value(best.high)};"
     text += f" trainings: {trainings}."
-    sides = grouped(rivals, lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low))
+    sides = grouped(
+        rivals,
+        lambda pair: (pair[1].low > best.high) - (pair[1].high < best.low),
+    )
     for side, beside in sides.items():
         text += f" {_VERDICTS[side]}: {', '.join(policy.name for _, policy in beside)}."
     if trained == len(returns):

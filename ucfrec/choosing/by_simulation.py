@@ -22,7 +22,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
-from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.by_ranking import LoggedEvidence
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleRecord, SimulatedRule, ValueEstimate
 from ucfrec.episodes.store import EpisodeStore
@@ -46,12 +46,14 @@ _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
 best are ruled out."""
 _SEED_OF_REST = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_FAR_OFF = 0.1
-"""Share by which an estimated value may be off, and half of that by which the user model may."""
+_LARGEST_ERROR = 0.08
+"""Of an estimate, as a share: four in five are then within 10%."""
+_FAR_OFF = 0.2
+"""Share by which the user model may be off."""
 _FEWEST_STEPS = 50
 """Effective logged steps of half of the users that correct an estimate."""
-_BINS = 10
-"""Groups of simulated steps by expected reward, each compared with logged steps."""
+_RAREST = 2.0
+"""Logged steps are weighted as if shown at least once in so many times the number of items."""
 _WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE = 256
@@ -75,6 +77,21 @@ class Outcomes(NamedTuple):
     """(M,), all that were shown."""
     expected: Float64Array
     """(M,) expected rewards of these."""
+
+
+class LoggedGains(NamedTuple):
+    """What M logged steps were worth beyond what fits that have not seen them expect."""
+
+    expected: Float64Array
+    """(M,) rewards."""
+    gains: Float64Array
+    """(M,) rewards beyond these."""
+    weights: Float64Array
+    """(M,) as if all items had been shown alike; ones without propensities."""
+
+    def at(self, rows: BoolArray) -> "LoggedGains":
+        """Those of some steps."""
+        return LoggedGains._make(column[rows] for column in self)
 
 
 class _ManyRules(PolicyActor):
@@ -371,18 +388,24 @@ class RuleSearch:
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it; those of either
-        half of the users are corrected by logged steps of that half."""
+        half of the users are corrected by logged steps of that half.
+
+        Held-out steps show what steps gain: item vectors have seen the training rewards. What of it
+        the log's policies gained by what the log does not show is a difference between weights of
+        training steps.
+        """
         halves = [self._roll_half(rule, number) for number in (0, 1)]
-        sessions = draw_sessions(self.problem.train, self.problem.seed)
-        episodes, steps = sessions.all_steps()
-        propensities = read_propensities(sessions, episodes, steps)
-        weights = np.ones(len(steps)) if propensities is None else 1 / propensities
-        expected, users = self.users.expect_unseen(sessions), number_users(sessions)[episodes]
-        gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
-        corrections = []
-        for number, half in enumerate(halves):
-            rows = users % 2 == number
-            corrections.append(_correct(half, expected[rows], gains[rows], weights[rows]))
+        problem, users, corrections = self.problem, self.users, []
+        train, held_out = (
+            draw_sessions(v, problem.seed) for v in (problem.train, problem.validation)
+        )
+        logged = self._read_gains(train, users.expect_unseen(train))
+        later = self._read_gains(held_out, users.expect_held_out(held_out))
+        for half, own, own_later in zip(halves, logged, later, strict=True):
+            level, alike = (_correct(half, part, weighted=False) for part in (own_later, own))
+            weighted = _correct(half, own)
+            gain, error = level[0] + weighted[0] - alike[0], math.hypot(level[1], weighted[1])
+            corrections.append((gain, error, min(level[2], weighted[2])))
         gains, gain_errors, counts = np.transpose(corrections)
         values = gains + [half.returns.mean() for half in halves]
         value, gain = values.mean(), gains.mean()
@@ -390,11 +413,12 @@ class RuleSearch:
         errors = [_standard_error(half.returns) for half in halves]
         error = max(math.hypot(*errors, *gain_errors), np.ptp(values)) / 2
         doubts = []
-        if error > _FAR_OFF * abs(value):
-            doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-        if abs(gain) > max(2 * _FAR_OFF * abs(value - gain), 2 * gain_error):
+        if error > _LARGEST_ERROR * abs(value):
+            doubts.append(f"its error, {error:.2g}, is more than {_LARGEST_ERROR:.0%} of it")
+        if abs(gain) > max(_FAR_OFF * abs(value - gain), 2 * gain_error):
             doubts.append(f"the user model is off by {-gain:+.2g} at logged steps like its own")
-        if propensities is None:
+        episodes, steps = train.all_steps()
+        if read_propensities(train, episodes, steps) is None:
             doubts.append("the log has rows without propensities, whose policy may have known more")
         elif counts.min() < _FEWEST_STEPS:
             doubts.append(f"only {counts.min():.0f} effective logged steps are like its own")
@@ -406,6 +430,16 @@ class RuleSearch:
         first, second = values
         return ValueEstimate(value, error, (first, second), (gain, gain_error), tuple(doubts))
 
+    def _read_gains(self, sessions: EpisodeStore, expected: Float64Array) -> list[LoggedGains]:
+        """Of all steps of logged sessions of either half of the users, with `expected` rewards."""
+        episodes, steps = sessions.all_steps()
+        propensities, weights = read_propensities(sessions, episodes, steps), np.ones(len(steps))
+        if propensities is not None:
+            weights = np.minimum(1 / propensities, _RAREST * len(self.users.rewarding.item))
+        gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
+        logged, users = LoggedGains(expected, gains, weights), number_users(sessions)[episodes]
+        return [logged.at(users % 2 == number) for number in (0, 1)]
+
     def _roll_half(self, rule: DecisionRule, number: int) -> Outcomes:
         """Sessions of one half of the users, with those last that begin as the search's do."""
         users, n = number_users(self._store), self._config.sessions
@@ -416,25 +450,22 @@ class RuleSearch:
 
 
 def _correct(
-    simulated: Outcomes,
-    expected: Float64Array,
-    gains: Float64Array,
-    weights: Float64Array,
+    simulated: Outcomes, logged: LoggedGains, weighted: bool = True
 ) -> tuple[float, float, float]:
-    """How much more a simulated session would have if its steps had what logged steps (M,) of like
-    `expected` reward gain beyond it, the standard error, and the effective number of these."""
-    edges = np.quantile(simulated.expected, np.arange(_BINS) / _BINS)
-    rows = expected >= edges[0]
-    gains, weights, bins = gains[rows], weights[rows], np.searchsorted(edges[1:], expected[rows])
-    counts = np.bincount(np.searchsorted(edges[1:], simulated.expected), minlength=_BINS)
-    totals = np.bincount(bins, weights, _BINS)
-    if totals[counts > 0].min() == 0:
+    """How much more a simulated session would have if its steps gained what a line through logged
+    steps says of their expected reward, the standard error, and the effective number of these."""
+    expected, gains, weights = logged.at(logged.expected >= simulated.expected.min())
+    if not len(gains):
         return 0.0, 0.0, 0.0
-    # Each logged step stands for simulated ones.
-    weights = weights * (counts / len(simulated.returns))[bins] / totals[bins]
-    gain = (weights * gains).sum()
-    error = float(np.linalg.norm(weights * (gains - gain / weights.sum())))
-    return gain, error, effective_number(weights)
+    shares = weights / weights.sum() if weighted else np.full(len(gains), 1 / len(gains))
+    beyond = expected - shares @ expected
+    slopes = shares * beyond / (shares @ np.square(beyond) or 1.0)
+    # The line at the mean expected reward of simulated steps is a weighted sum of the gains.
+    weights = shares + (simulated.expected.mean() - shares @ expected) * slopes
+    errors = gains - shares @ gains - (slopes @ gains) * beyond
+    steps = len(simulated.expected) / len(simulated.returns)
+    error = float(np.linalg.norm(weights * errors))
+    return steps * float(weights @ gains), steps * error, effective_number(weights)
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

@@ -18,7 +18,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, IntArray
 from ucfrec.choosing.by_simulation import (
-    LoggedGains,
     Outcomes,
     RuleSearch,
     _correct,
@@ -229,8 +228,7 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
         # Of what is promising, half of the logged steps have less; the log rarely shows these.
         expected, poor = rng.random(4000), rng.random(4000) < 0.5
         gains, weights = np.where((expected > 0.5) & poor, -0.2, 0.0), np.where(poor, 4.0, 1.0)
-        logged = LoggedGains(expected, gains, weights)
-        results.append(_correct(simulated, logged))
+        results.append(_correct(simulated, (expected, gains, weights)))
     values, errors, steps = np.transpose(results)
     assert values.mean() == pytest.approx(5 * -0.2 * 0.8, abs=0.005)
     assert errors.mean() == pytest.approx(values.std(), rel=0.2)
@@ -238,14 +236,16 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
     # What gains the less the more it promises does so beyond what was logged, with fewer steps.
     counts = []
     for most in (1.0, 0.7):
-        falling = logged._replace(gains=0.1 - expected).at(expected < most)
+        low = expected[expected < most]
+        falling = low, 0.1 - low, np.zeros(len(low))
         gain, error, n = _correct(simulated, falling, weighted=False)
         assert gain == pytest.approx(5 * (0.1 - simulated.expected.mean()))
         assert error == pytest.approx(0, abs=1e-9)
         counts.append(n)
     assert counts[1] < 50 < 500 < counts[0]
     # Nothing that the log shows promises as much.
-    assert _correct(simulated, logged.at(expected < 0.5)) == (0.0, 0.0, 0.0)
+    low = expected[expected < 0.5]
+    assert _correct(simulated, (low, low, low)) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.slow

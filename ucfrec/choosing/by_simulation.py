@@ -22,7 +22,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.by_ranking import LoggedEvidence
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleRecord, SimulatedRule, ValueEstimate
 from ucfrec.episodes.store import EpisodeStore
@@ -46,10 +46,8 @@ _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
 best are ruled out."""
 _SEED_OF_REST = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_LARGEST_ERROR = 0.08
-"""Of an estimate, as a share: four in five are then within 10%."""
-_FAR_OFF = 0.2
-"""Share by which the user model may be off."""
+_LARGEST_ERROR, _FAR_OFF = 0.08, 0.2
+"""Shares of an estimate: of its error, so that four in five are within 10%, and of the model's."""
 _FEWEST_STEPS = 50
 """Effective logged steps of half of the users that correct an estimate."""
 _RAREST = 2.0
@@ -67,6 +65,10 @@ _NEAR_THE_LOG = (
 """Candidates where a rule must leave effective users of a log with propensities."""
 _value = attrgetter("value")
 
+_Gains = tuple[Float64Array, Float64Array, Float64Array]
+"""Of M logged steps: rewards that fits that have not seen them expect, what they gained beyond
+these, and weights as if all items had been shown alike, (M,) each."""
+
 
 class Outcomes(NamedTuple):
     """What happened in n simulated sessions of one rule."""
@@ -77,21 +79,6 @@ class Outcomes(NamedTuple):
     """(M,), all that were shown."""
     expected: Float64Array
     """(M,) expected rewards of these."""
-
-
-class LoggedGains(NamedTuple):
-    """What M logged steps were worth beyond what fits that have not seen them expect."""
-
-    expected: Float64Array
-    """(M,) rewards."""
-    gains: Float64Array
-    """(M,) rewards beyond these."""
-    weights: Float64Array
-    """(M,) as if all items had been shown alike; ones without propensities."""
-
-    def at(self, rows: BoolArray) -> "LoggedGains":
-        """Those of some steps."""
-        return LoggedGains._make(column[rows] for column in self)
 
 
 class _ManyRules(PolicyActor):
@@ -388,17 +375,14 @@ class RuleSearch:
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it; those of either
-        half of the users are corrected by logged steps of that half.
-
-        Held-out steps show what steps gain: item vectors have seen the training rewards. What of it
-        the log's policies gained by what the log does not show is a difference between weights of
-        training steps.
+        half of the users are corrected by logged steps of that half: by what held-out ones gained,
+        as item vectors have seen the training rewards, less what training ones owe to a policy that
+        knew more than the log shows, the difference that weights make.
         """
         halves = [self._roll_half(rule, number) for number in (0, 1)]
-        problem, users, corrections = self.problem, self.users, []
-        train, held_out = (
-            draw_sessions(v, problem.seed) for v in (problem.train, problem.validation)
-        )
+        seed, users, corrections = self.problem.seed, self.users, []
+        train = draw_sessions(self.problem.train, seed)
+        held_out = draw_sessions(self.problem.validation, seed)
         logged = self._read_gains(train, users.expect_unseen(train))
         later = self._read_gains(held_out, users.expect_held_out(held_out))
         for half, own, own_later in zip(halves, logged, later, strict=True):
@@ -430,15 +414,15 @@ class RuleSearch:
         first, second = values
         return ValueEstimate(value, error, (first, second), (gain, gain_error), tuple(doubts))
 
-    def _read_gains(self, sessions: EpisodeStore, expected: Float64Array) -> list[LoggedGains]:
+    def _read_gains(self, sessions: EpisodeStore, expected: Float64Array) -> list[_Gains]:
         """Of all steps of logged sessions of either half of the users, with `expected` rewards."""
         episodes, steps = sessions.all_steps()
         propensities, weights = read_propensities(sessions, episodes, steps), np.ones(len(steps))
         if propensities is not None:
             weights = np.minimum(1 / propensities, _RAREST * len(self.users.rewarding.item))
         gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
-        logged, users = LoggedGains(expected, gains, weights), number_users(sessions)[episodes]
-        return [logged.at(users % 2 == number) for number in (0, 1)]
+        odd = number_users(sessions)[episodes] % 2 == 1
+        return [(expected[half], gains[half], weights[half]) for half in (~odd, odd)]
 
     def _roll_half(self, rule: DecisionRule, number: int) -> Outcomes:
         """Sessions of one half of the users, with those last that begin as the search's do."""
@@ -450,11 +434,12 @@ class RuleSearch:
 
 
 def _correct(
-    simulated: Outcomes, logged: LoggedGains, weighted: bool = True
+    simulated: Outcomes, logged: _Gains, weighted: bool = True
 ) -> tuple[float, float, float]:
     """How much more a simulated session would have if its steps gained what a line through logged
     steps says of their expected reward, the standard error, and the effective number of these."""
-    expected, gains, weights = logged.at(logged.expected >= simulated.expected.min())
+    rows = logged[0] >= simulated.expected.min()
+    expected, gains, weights = (values[rows] for values in logged)
     if not len(gains):
         return 0.0, 0.0, 0.0
     shares = weights / weights.sum() if weighted else np.full(len(gains), 1 / len(gains))

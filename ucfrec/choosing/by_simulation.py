@@ -64,7 +64,6 @@ _NEAR_THE_LOG = (
 )
 """Candidates where a rule must leave effective users of a log with propensities."""
 _value = attrgetter("value")
-
 _Gains = tuple[Float64Array, Float64Array, Float64Array]
 """Of M logged steps: rewards that fits that have not seen them expect, what they gained beyond
 these, and weights as if all items had been shown alike, (M,) each."""

@@ -228,14 +228,24 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
         # Of what is promising, half of the logged steps have less; the log rarely shows these.
         expected, poor = rng.random(4000), rng.random(4000) < 0.5
         gains, weights = np.where((expected > 0.5) & poor, -0.2, 0.0), np.where(poor, 4.0, 1.0)
-        results.append(_correct(simulated, expected, gains, weights))
+        results.append(_correct(simulated, (expected, gains, weights)))
     values, errors, steps = np.transpose(results)
     assert values.mean() == pytest.approx(5 * -0.2 * 0.8, abs=0.005)
     assert errors.mean() == pytest.approx(values.std(), rel=0.2)
     assert ((steps > 0.6 * 1200) & (steps < 1200)).all()
-    # Nothing that the log shows promises as much as a part of the simulated steps.
-    low = expected < 0.8
-    assert _correct(simulated, expected[low], gains[low], weights[low]) == (0.0, 0.0, 0.0)
+    # What gains the less the more it promises does so beyond what was logged, with fewer steps.
+    counts = []
+    for most in (1.0, 0.7):
+        low = expected[expected < most]
+        falling = low, 0.1 - low, np.zeros(len(low))
+        gain, error, n = _correct(simulated, falling, weighted=False)
+        assert gain == pytest.approx(5 * (0.1 - simulated.expected.mean()))
+        assert error == pytest.approx(0, abs=1e-9)
+        counts.append(n)
+    assert counts[1] < 50 < 500 < counts[0]
+    # Nothing that the log shows promises as much.
+    low = expected[expected < 0.5]
+    assert _correct(simulated, (low, low, low)) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.slow

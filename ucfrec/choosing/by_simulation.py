@@ -46,12 +46,12 @@ _FIRST_PART, _ERRORS_BEHIND = 4, 3.0
 best are ruled out."""
 _SEED_OF_REST = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_FAR_OFF = 0.1
-"""Share by which an estimated value may be off, and half of that by which the user model may."""
+_LARGEST_ERROR, _FAR_OFF = 0.08, 0.2
+"""Shares of an estimate: of its error, so that four in five are within 10%, and of the model's."""
 _FEWEST_STEPS = 50
 """Effective logged steps of half of the users that correct an estimate."""
-_BINS = 10
-"""Groups of simulated steps by expected reward, each compared with logged steps."""
+_RAREST = 2.0
+"""Logged steps are weighted as if shown at least once in so many times the number of items."""
 _WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE = 256
@@ -64,6 +64,9 @@ _NEAR_THE_LOG = (
 )
 """Candidates where a rule must leave effective users of a log with propensities."""
 _value = attrgetter("value")
+_Gains = tuple[Float64Array, Float64Array, Float64Array]
+"""Of M logged steps: rewards that fits that have not seen them expect, what they gained beyond
+these, and weights as if all items had been shown alike, (M,) each."""
 
 
 class Outcomes(NamedTuple):
@@ -371,18 +374,21 @@ class RuleSearch:
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it; those of either
-        half of the users are corrected by logged steps of that half."""
+        half of the users are corrected by logged steps of that half: by what held-out ones gained,
+        as item vectors have seen the training rewards, less what training ones owe to a policy that
+        knew more than the log shows, the difference that weights make.
+        """
         halves = [self._roll_half(rule, number) for number in (0, 1)]
-        sessions = draw_sessions(self.problem.train, self.problem.seed)
-        episodes, steps = sessions.all_steps()
-        propensities = read_propensities(sessions, episodes, steps)
-        weights = np.ones(len(steps)) if propensities is None else 1 / propensities
-        expected, users = self.users.expect_unseen(sessions), number_users(sessions)[episodes]
-        gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
-        corrections = []
-        for number, half in enumerate(halves):
-            rows = users % 2 == number
-            corrections.append(_correct(half, expected[rows], gains[rows], weights[rows]))
+        seed, users, corrections = self.problem.seed, self.users, []
+        train = draw_sessions(self.problem.train, seed)
+        held_out = draw_sessions(self.problem.validation, seed)
+        logged = self._read_gains(train, users.expect_unseen(train))
+        later = self._read_gains(held_out, users.expect_held_out(held_out))
+        for half, own, own_later in zip(halves, logged, later, strict=True):
+            level, alike = (_correct(half, part, weighted=False) for part in (own_later, own))
+            weighted = _correct(half, own)
+            gain, error = level[0] + weighted[0] - alike[0], math.hypot(level[1], weighted[1])
+            corrections.append((gain, error, min(level[2], weighted[2])))
         gains, gain_errors, counts = np.transpose(corrections)
         values = gains + [half.returns.mean() for half in halves]
         value, gain = values.mean(), gains.mean()
@@ -390,11 +396,12 @@ class RuleSearch:
         errors = [_standard_error(half.returns) for half in halves]
         error = max(math.hypot(*errors, *gain_errors), np.ptp(values)) / 2
         doubts = []
-        if error > _FAR_OFF * abs(value):
-            doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-        if abs(gain) > max(2 * _FAR_OFF * abs(value - gain), 2 * gain_error):
+        if error > _LARGEST_ERROR * abs(value):
+            doubts.append(f"its error, {error:.2g}, is more than {_LARGEST_ERROR:.0%} of it")
+        if abs(gain) > max(_FAR_OFF * abs(value - gain), 2 * gain_error):
             doubts.append(f"the user model is off by {-gain:+.2g} at logged steps like its own")
-        if propensities is None:
+        episodes, steps = train.all_steps()
+        if read_propensities(train, episodes, steps) is None:
             doubts.append("the log has rows without propensities, whose policy may have known more")
         elif counts.min() < _FEWEST_STEPS:
             doubts.append(f"only {counts.min():.0f} effective logged steps are like its own")
@@ -406,6 +413,16 @@ class RuleSearch:
         first, second = values
         return ValueEstimate(value, error, (first, second), (gain, gain_error), tuple(doubts))
 
+    def _read_gains(self, sessions: EpisodeStore, expected: Float64Array) -> list[_Gains]:
+        """Of all steps of logged sessions of either half of the users, with `expected` rewards."""
+        episodes, steps = sessions.all_steps()
+        propensities, weights = read_propensities(sessions, episodes, steps), np.ones(len(steps))
+        if propensities is not None:
+            weights = np.minimum(1 / propensities, _RAREST * len(self.users.rewarding.item))
+        gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
+        odd = number_users(sessions)[episodes] % 2 == 1
+        return [(expected[half], gains[half], weights[half]) for half in (~odd, odd)]
+
     def _roll_half(self, rule: DecisionRule, number: int) -> Outcomes:
         """Sessions of one half of the users, with those last that begin as the search's do."""
         users, n = number_users(self._store), self._config.sessions
@@ -416,25 +433,23 @@ class RuleSearch:
 
 
 def _correct(
-    simulated: Outcomes,
-    expected: Float64Array,
-    gains: Float64Array,
-    weights: Float64Array,
+    simulated: Outcomes, logged: _Gains, weighted: bool = True
 ) -> tuple[float, float, float]:
-    """How much more a simulated session would have if its steps had what logged steps (M,) of like
-    `expected` reward gain beyond it, the standard error, and the effective number of these."""
-    edges = np.quantile(simulated.expected, np.arange(_BINS) / _BINS)
-    rows = expected >= edges[0]
-    gains, weights, bins = gains[rows], weights[rows], np.searchsorted(edges[1:], expected[rows])
-    counts = np.bincount(np.searchsorted(edges[1:], simulated.expected), minlength=_BINS)
-    totals = np.bincount(bins, weights, _BINS)
-    if totals[counts > 0].min() == 0:
+    """How much more a simulated session would have if its steps gained what a line through logged
+    steps says of their expected reward, the standard error, and the effective number of these."""
+    rows = logged[0] >= simulated.expected.min()
+    expected, gains, weights = (values[rows] for values in logged)
+    if not len(gains):
         return 0.0, 0.0, 0.0
-    # Each logged step stands for simulated ones.
-    weights = weights * (counts / len(simulated.returns))[bins] / totals[bins]
-    gain = (weights * gains).sum()
-    error = float(np.linalg.norm(weights * (gains - gain / weights.sum())))
-    return gain, error, effective_number(weights)
+    shares = weights / weights.sum() if weighted else np.full(len(gains), 1 / len(gains))
+    beyond = expected - shares @ expected
+    slopes = shares * beyond / (shares @ np.square(beyond) or 1.0)
+    # The line at the mean expected reward of simulated steps is a weighted sum of the gains.
+    weights = shares + (simulated.expected.mean() - shares @ expected) * slopes
+    errors = gains - shares @ gains - (slopes @ gains) * beyond
+    steps = len(simulated.expected) / len(simulated.returns)
+    error = float(np.linalg.norm(weights * errors))
+    return steps * float(weights @ gains), steps * error, effective_number(weights)
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

@@ -24,7 +24,7 @@ from ucfrec.user_model.reward_fit import (
     fit_training_users,
     score_unseen,
 )
-from ucfrec.user_model.reward_report import ItemRewardReport, calibrate
+from ucfrec.user_model.reward_report import ItemRewardReport, RewardRows, calibrate, score_rows
 from ucfrec.user_model.running import RunningRates
 from ucfrec.user_model.session_end import (
     SESSIONS,
@@ -148,6 +148,11 @@ class UserModel:
         weighted = self.reward_report.new_users
         rows, scores = score_unseen(self.rewarding, report.effects, weighted, sessions)
         return self._expect_of(scores, rows.history)
+
+    def expect_held_out(self, sessions: EpisodeStore) -> Float64Array:
+        """Expected rewards (M,) of all steps of sessions that it was not fitted to."""
+        rows = RewardRows.of(sessions, self.rewarding.reach, sessions.n_steps, 0)
+        return self._expect_of(score_rows(self.rewarding, rows), rows.history)
 
     def _expect_of(self, scores: Tensor, history: Shown) -> Float64Array:
         slope, intercept = self.calibration

@@ -43,7 +43,8 @@ def command_line() -> str:
 
     Result rows are published and must not reveal the folders of a machine.
     """
-    return " ".join([Path(sys.argv[0]).name, *map(shorten_paths, sys.argv[1:])])
+    program, *words = sys.argv
+    return " ".join([Path(program).name, *map(shorten_paths, words)])
 
 
 def shorten_paths(argument: str) -> str:

@@ -465,7 +465,8 @@ class _ItemProduct:
             # A product with one row reads this layout twice as fast as vectors one after the
             # other; NumPy asks for large pages, which are read faster.
             sizes = [block.shape[1] for block in blocks]
-            matrix = torch.from_numpy(np.empty((sum(sizes), len(blocks[0])), dtype=np.float32))
+            shape = sum(sizes), len(blocks[0])
+            matrix = torch.from_numpy(np.empty(shape, dtype=np.float32))
             for rows, block in zip(torch.split(matrix, sizes), blocks, strict=True):
                 rows.copy_(block.T)
             return matrix, bias, (of_policy, of_likeness)

@@ -172,7 +172,8 @@ def _batch_rules(rules: IntArray, most: int) -> list[list[tuple[int, slice]]]:
     batches of about `_ROWS_AT_ONCE` rows, or as many as one part."""
     numbers, first = np.unique(rules, return_index=True)
     batches, size = [list[tuple[int, slice]]()], 0
-    for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
+    ends = np.append(first[1:], len(rules))
+    for rule, begin, end in zip(numbers, first, ends, strict=True):
         for start in range(int(begin), int(end), most):
             stop = min(start + most, int(end))
             if size and size + stop - start > min(_ROWS_AT_ONCE, most):
@@ -385,9 +386,10 @@ class RuleSearch:
         logged = self._read_gains(train, users.expect_unseen(train))
         later = self._read_gains(held_out, users.expect_held_out(held_out))
         for half, own, own_later in zip(halves, logged, later, strict=True):
-            level, alike = (_correct(half, part, weighted=False) for part in (own_later, own))
-            weighted = _correct(half, own)
-            gain, error = level[0] + weighted[0] - alike[0], math.hypot(level[1], weighted[1])
+            level = _correct(half, own_later, weighted=False)
+            alike, weighted = _correct(half, own, weighted=False), _correct(half, own)
+            gain = level[0] + weighted[0] - alike[0]
+            error = math.hypot(level[1], weighted[1])
             corrections.append((gain, error, min(level[2], weighted[2])))
         gains, gain_errors, counts = np.transpose(corrections)
         values = gains + [half.returns.mean() for half in halves]

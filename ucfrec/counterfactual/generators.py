@@ -139,7 +139,8 @@ class TangentGenerator:
         matrices = clusters.covariances
         self._clusters = StateClusters(clusters.centres.to(crm.device), matrices.to(crm.device))
         values, vectors = torch.linalg.eigh(matrices)
-        self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
+        roots = vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+        self._roots = roots.to(crm.device)
 
     @torch.no_grad()
     def propose(
@@ -304,7 +305,8 @@ def _fit_faithful(
         # In standard deviations of the reward, so that λ does not depend on its scale.
         change = ((reward - r) / crm.reward_std).square().mean()
         length = move.norm(dim=1)
-        band = ((low - length).relu().square() + (length - high).relu().square()).mean()
+        below, above = (low - length).relu(), (length - high).relu()
+        band = (below.square() + above.square()).mean()
         parts = {"reward_change": change.detach(), "band": band.detach()}
         return config.lambda_r * change + config.lambda_band * band, parts
 

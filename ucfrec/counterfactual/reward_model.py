@@ -124,7 +124,8 @@ class CausalRewardModel(nn.Module):
     def encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
         """The posterior q_ϕ(z | s, a, r), of what `given` and `residual` return."""
         surprise = (residual / self.surprise_std).unsqueeze(-1)
-        mean, log_variance = self.encoder(torch.cat([inputs, surprise], dim=-1)).chunk(2, dim=-1)
+        encoded = self.encoder(torch.cat([inputs, surprise], dim=-1))
+        mean, log_variance = encoded.chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
     def abduct(
@@ -315,7 +316,8 @@ def _fit_mean(
     )
 
     def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
-        return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
+        expected = model.expected(batch[0]).squeeze(-1)
+        return (batch[1] - expected).square().mean(), {}
 
     first = copy.deepcopy(model.expected.state_dict())
     whole = _loop(model.config, len(rows[1]))

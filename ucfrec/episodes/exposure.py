@@ -215,7 +215,8 @@ class ExposureTerm(nn.Module):
         table = GAIN * (self.common + self.by_lag)
         at = exposed.returns.clamp(self.knots[0], self.knots[-1])
         # ONNX has no search in a sorted list, and these are few.
-        right = (self.knots < at.unsqueeze(1)).sum(1).clamp(1, len(self.knots) - 1)
+        right = (self.knots < at.unsqueeze(1)).sum(1)
+        right = right.clamp(1, len(self.knots) - 1)
         low, high = self.knots[right - 1], self.knots[right]
         share = ((at - low) / (high - low)).view(1, -1, 1)
         repeated, repeated_liked, alike, alike_liked = (

@@ -137,7 +137,8 @@ class Offer:
         item, begin, end = offers.later
         if len(item):
             columns = item if items is None else columns_of(item, items)
-            columns = torch.where(columns < 0, offered.shape[1], columns).expand(times.shape[0], -1)
+            columns = torch.where(columns < 0, offered.shape[1], columns)
+            columns = columns.expand(times.shape[0], -1)
             again = ((begin <= times) & (times < end)).int()
             counts = F.pad(offered.int(), (0, 1)).scatter_add(1, columns, again)
             offered = counts[:, :-1] > 0

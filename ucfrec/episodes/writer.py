@@ -116,7 +116,8 @@ class StoreWriter:
         while begin < len(offsets) - 1:
             end = max(int(np.searchsorted(offsets, offsets[begin] + _PART_STEPS)), begin + 1)
             part = offsets[begin : end + 1]
-            returns.append(ReturnToGo().of_logs(rewards[part[0] : part[-1]], part - part[0]))
+            of_part = rewards[part[0] : part[-1]]
+            returns.append(ReturnToGo().of_logs(of_part, part - part[0]))
             begin = end
         returns.close()
         self._files, self._offsets, self._episode_values = {}, [], {}

@@ -245,9 +245,10 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
     # Of each item that a user liked: whether it is recommended at the user's first step.
     liked_pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
     first = np.unique(owner, return_index=True)[1]
-    in_top = (ranked.top[first[liked_pairs[0]]] == liked_pairs[1][:, None]).any(axis=1)
-    n_liked = np.bincount(liked_pairs[0], minlength=len(users))
-    recalled = np.bincount(liked_pairs[0], in_top, len(users)) / np.maximum(n_liked, 1)
+    users_of, items_of = liked_pairs
+    in_top = (ranked.top[first[users_of]] == items_of[:, None]).any(axis=1)
+    n_liked = np.bincount(users_of, minlength=len(users))
+    recalled = np.bincount(users_of, in_top, len(users)) / np.maximum(n_liked, 1)
     by_step = {
         "hit_rate_shown": (hit, every),
         "ndcg_shown": (gain, every),

@@ -135,6 +135,7 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
         padded[: len(part)] = part
         parts = [torch.empty_like(padded) for _ in range(processes())]
         distributed.all_gather(parts, padded)
-        joined.append(torch.cat([part[:n] for part, n in zip(parts, counts, strict=True)]))
+        of_all = [part[:n] for part, n in zip(parts, counts, strict=True)]
+        joined.append(torch.cat(of_all))
     places, summands = joined[0].unsqueeze(0), joined[1]
     return torch.sparse_coo_tensor(places, summands, gradient.shape, check_invariants=False)

@@ -482,6 +482,6 @@ def _averages(
 
 def _age_rows(means: Tensor, weights: Tensor, log_shares: Tensor) -> Tensor:
     """Averages of rows (M, …) that rested for steps with Σ log d = `log_shares` (M,)."""
-    others = [1] * (means.dim() - 1)
-    share = log_shares.exp().to(means.dtype).view(-1, *others)
+    shape = [-1] + [1] * (means.dim() - 1)
+    share = log_shares.exp().to(means.dtype).view(shape)
     return torch.where(share < 1, torch.lerp(weights, means, share), means)

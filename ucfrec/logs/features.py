@@ -406,7 +406,8 @@ def encode_features(
                 value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
                 cases = f"SELECT number, train_count > 0 AS counts, {value} AS value FROM {joined}"
                 rows, columns = _rank_values(connection, cases, CATEGORIES)
-                values, size = np.ones(len(rows), np.float32), int(columns.max(initial=-1)) + 1
+                values = np.ones(len(rows), np.float32)
+                size = int(columns.max(initial=-1)) + 1
             entries.append((values, rows, columns + width))
             width += size
     if not width:

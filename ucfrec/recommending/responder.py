@@ -268,7 +268,8 @@ def parse_split(text: str) -> dict[str, float]:
             shares[name.strip()] = float(share)
         except ValueError:
             raise InputError(f"{text} are no shares of arms: write RUN=SHARE,RUN=SHARE") from None
-    if not all(0 < share <= 1 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
+    total = sum(shares.values())
+    if not all(0 < share <= 1 for share in shares.values()) or abs(total - 1) > 1e-6:
         raise InputError(f"{text}: shares are above 0 and add up to 1")
     return shares
 

@@ -196,7 +196,8 @@ def _compare(metric: str, rows: Sequence[ResultRow]) -> str:
         lows, highs = zip(*(row.interval or (-math.inf, math.inf) for row in group), strict=True)
         interval = Interval(f"{name} ({format_value(value)})", value, min(lows), max(highs))
         returns.append((len({row.training_seed for row in group} - {None}), interval))
-    (trainings, best), *rivals = sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
+    by_value = sorted(returns, key=lambda pair: (not pair[0], -pair[1].value))
+    (trainings, best), *rivals = by_value
     if not trainings:
         return f"Only built-in policies: {', '.join(policy.name for _, policy in returns)}."
     trained = sum(seeds > 0 for seeds, _ in returns)

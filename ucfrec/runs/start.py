@@ -158,7 +158,8 @@ def begin(
     returns = people.returns
     if not returns_to_go.per_session:
         returns = people.with_return_to_go(returns_to_go).column(schema.RETURN_TO_GO)
-    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    number = min(len(returns), _MOST_RETURNS)
+    places = np.linspace(0, len(returns) - 1, number).astype(np.int64)
     returns = np.sort(returns)[places].astype(np.float32)
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
@@ -253,7 +254,8 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
             policy.head.exposure.start_from(train.item_states, scaled)
     else:
         actions = train.column(schema.ACTION)
-        policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1e-6))
+        largest = torch.from_numpy(np.abs(actions).max(0))
+        policy.head.scale.copy_(largest.clamp(min=1e-6))
     policy.start_from(train)
     return policy
 

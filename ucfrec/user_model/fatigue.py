@@ -57,7 +57,8 @@ class MainTags:
         liked = self.liked(history.rewards) & (history.items >= 0)
         tags = torch.where(liked, self.tags[history.items], -1)
         lengths = []
-        previous, length = torch.full((len(tags),), -1), torch.zeros(len(tags), dtype=torch.int64)
+        previous = torch.full((len(tags),), -1)
+        length = torch.zeros(len(tags), dtype=torch.int64)
         for tag in reversed(tags.unbind(1)):
             length = (torch.where(tag == previous, length, 0) + 1).masked_fill(tag < 0, 0)
             previous = tag

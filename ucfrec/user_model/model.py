@@ -179,7 +179,8 @@ class LoggedRewards:
         self.values: Float64Array = values
         """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
         self._log_shares = np.log(counts / counts.sum())
-        self._slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
+        span = max(float(np.ptp(values)), 1e-12)
+        self._slopes = np.sinh(np.linspace(-8, 8, 801)) / span
         self._means = self._weigh(self._slopes) @ values
 
     def _weigh(self, slopes: Float64Array) -> Float64Array:

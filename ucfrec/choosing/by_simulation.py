@@ -50,7 +50,7 @@ _LARGEST_ERROR, _FAR_OFF = 0.08, 0.2
 """Shares of an estimate: of its error, so that four in five are within 10%, and of the model's."""
 _FEWEST_STEPS = 50
 """Effective logged steps of half of the users that correct an estimate."""
-_RAREST = 2.0
+_RAREST = 5.0
 """Logged steps are weighted as if shown at least once in so many times the number of items."""
 _WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""

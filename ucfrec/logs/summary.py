@@ -74,8 +74,7 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": None if cut.leave_last else list(cut.bounds),
         "steps": counts.steps,
-        # A few rows at one time are no lists.
-        "decisions": counts.decisions if counts.decisions < 0.9 * counts.steps else None,
+        "decisions": counts.decisions if counts.decisions < counts.steps else None,
         "episodes": sum(split["episodes"] for split in splits.values()),
         "sessions": sessions,
         "sessions_cut": unfinished - censored,
@@ -102,6 +101,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     """The report of `prepare` as a text table with one count per line."""
     rule, session_by = report.get("duplicates", "highest"), report["session_by"]
     steps, decisions = report["steps"], report.get("decisions")
+    lists = decisions and decisions < 0.9 * steps  # a few rows at one time are none
     counts = [
         (f"  dropped: {reason}", rows, f"  {REASONS.get(reason, '')}")
         for reason, rows in report["dropped"].items()
@@ -111,7 +111,7 @@ def format_report(report: Mapping[str, Any]) -> str:
         ("  conflicting duplicates", report["conflicting_duplicates"], conflicts),
         ("  at equal times", report["equal_times"], " (lists, or in no order to learn)"),
         ("  out of order", report["unsorted_rows"], " (sorted, none dropped)"),
-        ("steps kept", steps, f" in {decisions:,} decisions" if decisions else ""),
+        ("steps kept", steps, f" in {decisions:,} decisions" if lists else ""),
         ("users", report["users"], ""),
         ("items", report.get("items"), ""),
         ("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite"),

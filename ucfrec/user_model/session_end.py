@@ -343,7 +343,8 @@ class BoostedTrees:
         """(T, M) values of the trees' leaves."""
         columns = inputs.double().T.contiguous()
         leaves = []
-        for block in torch.split(columns, _ROWS, 1):
+        whole = torch.compiler.is_exporting()  # a graph takes any number of rows
+        for block in (columns,) if whole else torch.split(columns, _ROWS, 1):
             at_most = torch.le(block[self._numbers], self._thresholds).float()
             at_most = at_most.view(len(self._powers), len(self._leaves), block.shape[1])
             # Numbers of leaves, which float32 has exactly.

@@ -125,14 +125,14 @@ def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_policy_that_is_updated_earns_more_than_one_that_is_not(tmp_path: Path) -> None:
-    month = Month(days=4, sessions=300, users=600, settings=("train.steps=500", *SETTINGS))
+    # Intervals of a day share its log: of four days, one that is unlucky would be a quarter.
+    month = Month(days=7, sessions=300, users=600, settings=("train.steps=500", *SETTINGS))
     days: list[Day] = simulate(tmp_path, month)
     reward, frozen = (
         np.mean([getattr(each, name) for each in days[-2:]]) for name in ("reward", "frozen")
     )
     assert reward > 1.15 * frozen
-    # Intervals of a day share its log, so one unlucky day is a quarter of them.
-    assert np.mean([found for day in days for found in day.covered if found is not None]) > 0.6
+    assert np.mean([found for day in days for found in day.covered if found is not None]) > 0.7
 
 
 def test_the_publisher_trains_where_sessions_see_all_there_is(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, IntArray
 from ucfrec.choosing.by_simulation import (
+    LoggedGains,
     Outcomes,
     RuleSearch,
     _correct,
@@ -228,7 +229,7 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
         # Of what is promising, half of the logged steps have less; the log rarely shows these.
         expected, poor = rng.random(4000), rng.random(4000) < 0.5
         gains, weights = np.where((expected > 0.5) & poor, -0.2, 0.0), np.where(poor, 4.0, 1.0)
-        results.append(_correct(simulated, (expected, gains, weights)))
+        results.append(_correct(simulated, LoggedGains(expected, gains, weights)))
     values, errors, steps = np.transpose(results)
     assert values.mean() == pytest.approx(5 * -0.2 * 0.8, abs=0.005)
     assert errors.mean() == pytest.approx(values.std(), rel=0.2)
@@ -237,7 +238,7 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
     counts = []
     for most in (1.0, 0.7):
         low = expected[expected < most]
-        falling = low, 0.1 - low, np.zeros(len(low))
+        falling = LoggedGains(low, 0.1 - low, np.zeros(len(low)))
         gain, error, n = _correct(simulated, falling, weighted=False)
         assert gain == pytest.approx(5 * (0.1 - simulated.expected.mean()))
         assert error == pytest.approx(0, abs=1e-9)
@@ -245,7 +246,7 @@ def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> No
     assert counts[1] < 50 < 500 < counts[0]
     # Nothing that the log shows promises as much.
     low = expected[expected < 0.5]
-    assert _correct(simulated, (low, low, low)) == (0.0, 0.0, 0.0)
+    assert _correct(simulated, LoggedGains(low, low, low)) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.slow

@@ -24,8 +24,8 @@ from ucfrec.policies.dt import attend
 from ucfrec.policies.ucf import (
     Dropout,
     TokenEmbedding,
+    convolve_depthwise,
     interleave,
-    sum_shifted,
     visible_tokens,
 )
 from ucfrec.settings import require, settings_table
@@ -99,7 +99,7 @@ class _ConvBlock(nn.Module):
         filters: list[Tensor] = [*self.mixers.parameters()]  # a weight and a bias of each modality
         taps = torch.cat(filters[::2], 1).permute(2, 1, 0)
         bias = torch.stack(filters[1::2])
-        mixed = sum_shifted(normed, taps.repeat(1, steps, 1), bias.repeat(steps, 1))
+        mixed = convolve_depthwise(normed, taps.repeat(1, steps, 1), bias.repeat(steps, 1))
         hidden = (hidden + mixed)[:, rows]
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]
 

@@ -294,10 +294,10 @@ class CausalDepthwise(nn.Conv1d):
         """Map (B, K, d) to (B, K, d); steps where the mask (B, K) is false count as zeros."""
         steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)
         taps = self.weight[:, 0].T.contiguous()  # strided factors take three times as long
-        return sum_shifted(steps, taps[:, None], self.bias[None])  # type: ignore[index]
+        return convolve_depthwise(steps, taps[:, None], self.bias[None])  # type: ignore[index]
 
 
-def sum_shifted(
+def convolve_depthwise(
     steps: Tensor,
     taps: Tensor,
     bias: Tensor,
@@ -323,7 +323,7 @@ class _ShiftedProducts(torch.autograd.Function):
         ctx.save_for_backward(steps, taps)
         out = torch.addcmul(bias, steps, taps[-1])
         for back in range(1, len(taps)):
-            out[:, back:].addcmul_(steps[:, :-back], _rows(taps[-1 - back], back))
+            out[:, back:].addcmul_(steps[:, :-back], _taps_of_later(taps[-1 - back], back))
         return out
 
     @staticmethod
@@ -334,12 +334,12 @@ class _ShiftedProducts(torch.autograd.Function):
         of_taps[-1] = (gradient * steps).sum(over)
         for back in range(1, len(taps)):
             later, earlier = gradient[:, back:], steps[:, :-back]
-            of_steps[:, :-back].addcmul_(later, _rows(taps[-1 - back], back))
-            _rows(of_taps[-1 - back], back)[:] = (later * earlier).sum(over)
+            of_steps[:, :-back].addcmul_(later, _taps_of_later(taps[-1 - back], back))
+            _taps_of_later(of_taps[-1 - back], back)[:] = (later * earlier).sum(over)
         return of_steps, of_taps, gradient.sum(over).view(-1, gradient.shape[2])
 
 
-def _rows(
+def _taps_of_later(
     taps: Tensor,
     back: int,
 ) -> Tensor:

@@ -76,7 +76,7 @@ class ControlGridOptions(GridOptions):
     context: Annotated[Sequence[tuple[str, int]], context_given, "METHOD=STEPS"] = ()
     """Steps of history of a method; repeatable (default: the budget's)"""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 where the processor has its products (avx512_bf16, AMX, GPUs)"""
+    """Numbers of the policies' products; bfloat16 is for CPUs with avx512_bf16 or AMX, and GPUs"""
     budget: Literal["small", "medium", "full"] = "small"
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
     times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes

@@ -2,6 +2,7 @@
 
     python benchmarks/acting_time.py RUN
     python benchmarks/acting_time.py RUN --against CHECKOUT     # the same by another checkout
+    python benchmarks/acting_time.py --candidates 1000 RUN      # also with so many candidates
     python benchmarks/acting_time.py RUN -- --k 20 --reward-weight 2    # options of `recommend`
 
 Every request is of a new user with 20 rows of history. Two checkouts answer in turn, each in a
@@ -16,11 +17,13 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from measured_rows import append_row, make_parser
 
+from ucfrec.arrays import Array
 from ucfrec.reporting.tables import markdown_table
 
 HERE = Path(__file__).resolve().parents[1]
@@ -63,32 +66,52 @@ class Stream:
         self._process.communicate()
 
 
-def make_line(run: Path, rng: np.random.Generator, user: int) -> bytes:
-    """A request of a user with some of the run's items."""
-    items = pd.read_parquet(run / "items.parquet")["item_id"].to_numpy()
+def make_request(items: Array, rng: np.random.Generator, user: int) -> dict[str, Any]:
+    """A request of a user with some of the items."""
     history = [
         {"item_id": item, "timestamp": BEGIN + 1000 * n, "reward": n % 2, "session_id": 1}
         for n, item in enumerate(rng.choice(items, size=HISTORY).tolist())
     ]
-    return json.dumps({"user_id": f"user {user}", "history": history}).encode() + b"\n"
+    return {"user_id": f"user {user}", "history": history}
+
+
+def draw_candidates(items: Array, rng: np.random.Generator, number: int) -> dict[str, Any]:
+    """The part of a request that names so many candidates; nothing for 0."""
+    some = rng.choice(items, min(number, len(items)), replace=False).tolist()
+    return {"candidates": some} if number else {}
 
 
 def main() -> None:
     parser = make_parser(__doc__, SUITE)
     parser.add_argument("run", type=Path, help="run folder of a policy of items")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
+    parser.add_argument("--candidates", type=int, help="also time requests with so many candidates")
     parser.add_argument("--rounds", type=int, default=300, help="timed requests (300)")
     parser.add_argument("options", nargs="*", help="options of `ucfrec recommend`, after --")
     options = parser.parse_args()
-    checkouts = [HERE, *([options.against.resolve()] if options.against else [])]
+    items = pd.read_parquet(options.run / "items.parquet")["item_id"].to_numpy()
     rng = np.random.default_rng(0)
-    lines = [make_line(options.run, rng, user) for user in range(options.rounds + WARM_UP)]
+    requests = [make_request(items, rng, user) for user in range(options.rounds + WARM_UP)]
+    checkouts = [HERE, *([options.against.resolve()] if options.against else [])]
     streams = [Stream(checkout, options.run, options.options) for checkout in checkouts]
-    times = np.array([[stream.answer(line) for stream in streams] for line in lines])[WARM_UP:]
+    arms = [(checkout.name, stream, 0) for checkout, stream in zip(checkouts, streams, strict=True)]
+    if options.candidates:
+        name = f"{HERE.name}, {options.candidates} candidates"
+        arms.append((name, streams[0], options.candidates))
+    taken = []
+    for request in requests:
+        lines = [request | draw_candidates(items, rng, number) for _, _, number in arms]
+        taken.append(
+            [
+                stream.answer(json.dumps(line).encode() + b"\n")
+                for (_, stream, _), line in zip(arms, lines, strict=True)
+            ]
+        )
+    times = np.array(taken)[WARM_UP:]
     for stream in streams:
         stream.close()
     table = []
-    for checkout, (cpu, wall) in zip(checkouts, times.transpose(1, 2, 0), strict=True):
+    for (name, _, _), (cpu, wall) in zip(arms, times.transpose(1, 2, 0), strict=True):
         metrics = {
             "ratio": float(np.median(times[:, 0, 0] / cpu)),
             "median_ms": float(np.median(cpu)),
@@ -97,10 +120,8 @@ def main() -> None:
         }
         conditions = {"rounds": options.rounds, "options": " ".join(options.options)}
         about = {"conditions": conditions, "wall_time_s": float(wall.sum() / 1e3)}
-        append_row(
-            options.results, SUITE, "one user", checkout.name, metrics, policy="ucf", **about
-        )
-        table.append((checkout.name, *(f"{value:.3g}" for value in metrics.values())))
+        append_row(options.results, SUITE, "one user", name, metrics, policy="ucf", **about)
+        table.append((name, *(f"{value:.3g}" for value in metrics.values())))
     head = ("checkout", "this one's CPU time / its", "median, ms", "99%, ms", "99%, clock, ms")
     print(markdown_table(head, table))
 

@@ -124,6 +124,7 @@ def main() -> None:
     parser.add_argument("--log", type=int, default=0, help="seed of the log")
     parser.add_argument("--seeds", type=int, default=1, help="training seeds")
     parser.add_argument("--policy", action="append", help="ours (default: sasrec)")
+    parser.add_argument("--set", action="append", default=[], help="setting of ours; repeatable")
     parser.add_argument("--rectools", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.rectools is not None:
@@ -146,6 +147,7 @@ def main() -> None:
             updates = int(measured[4])
         for policy in options.policy or ["sasrec"]:
             how, out = ["--policy", policy, "--seed", str(seed)], options.out / f"{policy}-{seed}"
+            how += [word for text in options.set for word in ("--set", text)]
             print_row(policy, seed, rank_with_ucfrec(options.out, out, how))
             if updates:
                 settings = f"train.steps={updates}", "train.patience=0", f"train.batch_size={BATCH}"

@@ -1,6 +1,7 @@
 """CPU time of a training step of every policy on one thread, as a ratio to those of DT and DC.
 
     python benchmarks/step_time.py --dim 128 --context 20
+    python benchmarks/step_time.py --bfloat16      # also with products in bfloat16
 
 Appends the rows to runs/step_time/results.jsonl, or to --results, and prints a table. Only ratios
 are kept: the policies are timed in turn, so a slower machine slows all of them.
@@ -41,14 +42,15 @@ def windows(batch: int, context: int) -> Windows:
 Step = Callable[[], None]
 
 
-def step_of(policy: SequencePolicy, batch: Windows) -> Step:
-    """A training step of a policy."""
+def step_of(policy: SequencePolicy, batch: Windows, lower: bool = False) -> Step:
+    """A training step of a policy; with `lower`, its products are computed in bfloat16."""
     optimizer = RowAdamW(policy.parameters(), fused=True)
 
     def step() -> None:
-        loss, _ = policy.loss(batch)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=lower):
+            loss, _ = policy.loss(batch)
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.float().backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(policy.parameters(), 0.25)
         optimizer.step()
 
@@ -69,6 +71,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64, help="windows of a batch (default: 64)")
     parser.add_argument("--rounds", type=int, default=20, help="timed rounds (default: 20)")
     parser.add_argument("--policy", action="append", choices=POLICIES, help="repeatable (all)")
+    parser.add_argument("--bfloat16", action="store_true", help="time products in bfloat16, too")
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -78,6 +81,8 @@ def main() -> None:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
         config = resolve_config(name, None, settings).policy
         steps[name] = step_of(policy_class(name)(config, SIZES), batch)
+        if options.bfloat16:
+            steps[f"{name}, bfloat16"] = step_of(policy_class(name)(config, SIZES), batch, True)
     rounds = range(options.rounds + 2)
     taken = np.array([[seconds(step) for step in steps.values()] for _ in rounds][2:])
     times = dict(zip(steps, taken.T, strict=True))
@@ -86,11 +91,16 @@ def main() -> None:
     for name, own in times.items():
         low, middle, high = np.quantile(own / times["dt"], [0.1, 0.5, 0.9]).tolist()
         to_dc = float(np.median(own / times["dc"]))
-        lines.append((name, f"{middle:.2f} [{low:.2f}, {high:.2f}]", f"{to_dc:.3f}"))
+        of_float32 = float(np.median(own / times[name.removesuffix(", bfloat16")]))
         ratios = {"ratio": middle, "ratio_10": low, "ratio_90": high, "ratio_to_dc": to_dc}
+        ratios["ratio_to_float32"] = of_float32
+        lines.append(
+            (name, f"{middle:.2f} [{low:.2f}, {high:.2f}]", f"{to_dc:.3f}", f"{of_float32:.2f}")
+        )
         about = {"conditions": sizes, "wall_time_s": float(own.sum())}
         append_row(options.results, SUITE, "random windows", name, ratios, **about)
-    print(markdown_table(("policy", "time of a step / DT's, median [10%, 90%]", "/ DC's"), lines))
+    head = ("policy", "time of a step / DT's, median [10%, 90%]", "/ DC's", "/ its own in float32")
+    print(markdown_table(head, lines))
 
 
 if __name__ == "__main__":

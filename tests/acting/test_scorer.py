@@ -23,7 +23,7 @@ from tests.policies.test_ucf import (
     sessions_of,
 )
 from tests.support.replay import replayed
-from tests.support.served import boredom, learn_tastes
+from tests.support.served import boredom, learn_interests
 from tests.support.tagged import ITEMS as MANY
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
@@ -58,7 +58,7 @@ RULES = {
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
     "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
     "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
-    # By tastes learned in the session.
+    # By interests, also those shown in the session.
     "weighted": DecisionRule(3.0, temperature=1.0, reward_weight=1.0),
 }
 EXPOSURE = {"exposure": True, "exposure_window": 3}
@@ -89,7 +89,7 @@ def trained(folder: Path, request: pytest.FixtureRequest) -> TrainedPolicy:
     views = training_views(EpisodeStore.open(folder / "store"))
     model, _ = fit_item_reward_model(*views, folder / "rewards", seed=0)
     trained = replace(trained, reward_model=model)
-    learn_tastes(trained)
+    learn_interests(trained)
     return trained
 
 
@@ -107,8 +107,8 @@ def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
     for each in ("vectors", "item", "user", "affinity", "state", "interaction", "exposure"):
         model.get_buffer(each).normal_()
     model.likeness.start_from(states)
-    model.tastes.root.copy_(torch.randn(5, 5).tril())
-    model.tastes.weigh(0.7)
+    model.interests.sums.uniform_()
+    model.interests.weigh(torch.randn(5))
     model.binary.fill_(True)
     if isinstance(policy, ItemKNNPolicy):
         policy.cosines.uniform_(0.1, 1)

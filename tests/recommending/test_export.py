@@ -20,6 +20,7 @@ from tests.support.served import (
     SETTINGS,
     boredom,
     histories,
+    learn_interests,
     learn_tastes,
     observed_log,
     requests_of,
@@ -125,9 +126,8 @@ def test_the_graph_recommends_what_the_policy_does(
 ) -> None:
     given = trained if tags else plain
     given = replace(given, session_end=boredom(given.reward_model.likeness))  # type: ignore[union-attr]
-    if tags:
-        given = replace(given, reward_model=copy.deepcopy(given.reward_model))
-        learn_tastes(given)
+    given = replace(given, reward_model=copy.deepcopy(given.reward_model))
+    (learn_tastes if tags else learn_interests)(given)
     # Several sessions and one are compared with torch in there.
     assert export(given, tmp_path / "out", rule=rule, k=20).difference <= 1e-5
     log = histories()
@@ -238,7 +238,7 @@ def test_the_graph_finds_the_best_in_the_order_of_recommend(tmp_path: Path) -> N
 @pytest.fixture(scope="module")
 def ending(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     trained = trained_run(tmp_path_factory.mktemp("scores"))
-    learn_tastes(trained)
+    learn_interests(trained)
     return replace(trained, session_end=boredom(trained.reward_model.likeness))
 
 

@@ -60,7 +60,15 @@ def learn_tastes(trained: TrainedPolicy) -> None:
     tastes, random = trained.reward_model.tastes, torch.Generator().manual_seed(3)
     tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())
     tastes.usual.fill_(0.4)
-    tastes.weigh(1.5)
+    tastes.weigh(torch.tensor(1.5))
+
+
+def learn_interests(trained: TrainedPolicy) -> None:
+    """Give the run's reward model interests of users, known and new."""
+    interests, random = trained.reward_model.interests, torch.Generator().manual_seed(3)
+    for values in (interests.usual, interests.sums):
+        values.copy_(torch.rand(values.shape, generator=random))
+    interests.weigh(torch.randn(interests.weights.shape, generator=random))
 
 
 def boredom(likeness: Likeness) -> SessionEnd:

@@ -94,7 +94,7 @@ def test_missing_lags_are_steps_before_the_session_and_unknown_users_are_alike()
     # The level is what all items share.
     for effects in (model.interaction, model.affinity, model.exposure):
         effects.zero_()
-    level = model.level(states, None, model.tastes_after(shown)).unsqueeze(1)
+    level = model.level(states, None, model.tastes_after(shown, None)).unsqueeze(1)
     rest = model.scores(states, shown) - level
     torch.testing.assert_close(rest, model.item.expand(4, -1), atol=1e-5, rtol=0)
 
@@ -118,7 +118,7 @@ def planted_tastes(seed: int = 0) -> tuple[UserPosterior, Tensor]:
     tastes = UserPosterior(CATALOGUE, SIZE)
     tastes.root.copy_(torch.randn(SIZE + 1, SIZE + 1, generator=random).tril())
     tastes.usual.copy_(torch.rand(CATALOGUE, generator=random))
-    tastes.weigh(2.5)
+    tastes.weigh(torch.tensor(2.5))
     return tastes, torch.randn(CATALOGUE, SIZE, generator=random)
 
 

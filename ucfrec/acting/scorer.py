@@ -386,7 +386,7 @@ class Scorer:
         assert model is not None
         assert end is not None
         users, recent = query.sessions.users, query.sessions.shown
-        tastes = model.tastes_after(recent.latest(model.reach))
+        tastes = model.tastes_after(recent.latest(model.reach), users)
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span, steps = model.reward_high - model.reward_low, query.sessions.steps
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
@@ -516,7 +516,8 @@ class _ItemProduct:
         """The reward model's part, in states (B, S) before the steps to decide."""
         model, recent = self._model, sessions.shown
         assert model is not None
-        query = model.query(states, sessions.users, model.tastes_after(recent))
+        tastes = model.tastes_after(recent, sessions.users)
+        query = model.query(states, sessions.users, tastes)
         _, repeated, alike = model.exposures(recent)
         factors = F.pad(query, (0, 1), value=1.0)
         return Part(

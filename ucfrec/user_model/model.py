@@ -17,6 +17,7 @@ from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
+from ucfrec.user_model.interest import UserRows
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import (
     TrainingUsersReport,
@@ -108,6 +109,8 @@ class UserModel:
             save_tensors(path, dict(end.tensors), fitted)
         for model in (reward, *([users[0]] if users else [])):
             model.rates = RunningRates.of(train, model.target)
+        if reward.interests.are_known:
+            reward.user_rows = UserRows.of(train.whole, reward.target)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]

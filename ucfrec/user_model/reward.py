@@ -1,7 +1,7 @@
 """Expected reward of every item of a catalogue: additive effects of items, users and the state."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.windows import Shown
+from ucfrec.user_model.interest import Interests, UserRows, Weighted
 from ucfrec.user_model.running import AGES, RunningRates, TimeBins
 
 MEMORY = 50
@@ -29,7 +30,7 @@ CLIP = 5.0
 """Standardised states beyond this many standard deviations are clipped."""
 
 
-class UserPosterior(nn.Module):
+class UserPosterior(Weighted):
     """Tastes of the users of B sessions, from what was shown to them, and its rewards.
 
     Tastes v = (level, affinity) add v · (1, e_i) to the score of an item with the vector e_i, and
@@ -45,19 +46,6 @@ class UserPosterior(nn.Module):
         """L with L Lᵀ = C, in units of the standard deviation of the noise."""
         self.usual = nn.Buffer(torch.zeros(items))
         """The reward of every item with a user without tastes of their own, as `targets`."""
-        self.weight = nn.Buffer(torch.zeros(()))
-        """Scores per unit of target; 0 if sessions show nothing."""
-        self.are_known = False
-        """Whether sessions show tastes."""
-
-    def weigh(self, weight: Tensor | float) -> None:
-        """Set the weight; 0 if sessions show nothing."""
-        self.weight.fill_(weight)
-        self.are_known = bool(self.weight != 0)
-
-    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
-        super()._load_from_state_dict(*arguments, **options)
-        self.weigh(self.weight)
 
     def forward(
         self,
@@ -65,7 +53,7 @@ class UserPosterior(nn.Module):
         vectors: Tensor,
         targets: Tensor,
     ) -> Tensor:
-        """Posterior means (B, D + 1) of level and affinity, times `weight`.
+        """Posterior means (B, D + 1) of level and affinity, times `weights`.
 
         Args:
             items: (B, N) int64 items shown, in any order; −1 for none.
@@ -77,7 +65,7 @@ class UserPosterior(nn.Module):
         unusual = (targets - self.usual[items]) * valid
         matrix = inputs.mT @ inputs + torch.eye(len(self.root), device=inputs.device)
         solution = _solution(matrix, inputs.mT @ unusual.unsqueeze(2)).squeeze(2)
-        return self.weight * (solution @ self.root.T)
+        return self.weights * (solution @ self.root.T)
 
 
 def _solution(matrix: Tensor, right: Tensor) -> Tensor:
@@ -134,12 +122,12 @@ class ItemRewardModel(nn.Module):
 
         η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i + list_i,
 
-    x being the standardised state, e_i the centred embedding of the item times a matrix `turn`,
-    after which users differ in all directions alike, and exposure_i what repeating an item, or
-    showing one like it, n steps after the last time adds (`Likeness`). list_i is 0 at the top of a
-    list; below, it is the effect of the place, and of the likeness to the items above, summed:
-    `scores` are of the top, so that places change no choice. For new users, user_u and affinity_u
-    are what the session shows of them (`UserPosterior`).
+    x being the standardised state, e_i the centred embedding of the item, and exposure_i what
+    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). list_i
+    is 0 at the top of a list; below, it is the effect of the place, and of the likeness to the
+    items above, summed: `scores` are of the top, so that places change no choice. What the user was
+    shown until the decision adds to user_u and affinity_u (`Interests`); for new users, these are
+    what the session shows (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     η is the log-odds of the higher of two rewards, otherwise the standardised reward.
     """
@@ -156,7 +144,6 @@ class ItemRewardModel(nn.Module):
         self.reward_mean = nn.Buffer(torch.zeros(()))
         self.state_mean = nn.Buffer(torch.zeros(state))
         self.vectors = nn.Buffer(torch.zeros(items, dim))
-        self.turn = nn.Buffer(torch.eye(dim))
         self.item = nn.Buffer(torch.zeros(items))
         self.user = nn.Buffer(torch.zeros(users))
         self.affinity = nn.Buffer(torch.zeros(users, dim))
@@ -175,11 +162,15 @@ class ItemRewardModel(nn.Module):
         self.above = nn.Buffer(torch.zeros(1))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
+        self.interests = Interests(users, items, dim)
+        self.user_rows: UserRows | None = None
+        """Of a store, until every decision; None for those of training and the session."""
 
     @property
     def reach(self) -> int:
         """Items shown before a step that its expected reward depends on."""
-        return max(self.lags, MEMORY) if self.tastes.are_known else self.lags
+        reads_more = self.tastes.are_known or self.interests.are_known
+        return max(self.lags, MEMORY) if reads_more else self.lags
 
     def sum_running(self, offer: Offer | None, items: Tensor | None = None) -> Tensor:
         """What the running rates and ages add at M decisions: (M,) of one item (M,) each, or
@@ -206,7 +197,7 @@ class ItemRewardModel(nn.Module):
             users: (B,) int64 numbers in the training store, −1 if unknown; None if all are.
         """
         items, repeated, alike = self.exposures(history)
-        tastes = self.tastes_after(history)
+        tastes = self.tastes_after(history, users)
         scores = self.item + self.query(states, users, tastes) @ self.vectors.T
         scores = self.likeness.added_to(scores, self.likeness.profile(items, alike))
         rows, lags = torch.nonzero(items >= 0, as_tuple=True)
@@ -221,9 +212,10 @@ class ItemRewardModel(nn.Module):
         items: Tensor,
         offer: Offer | None = None,
         above: Tensor | None = None,
+        sums: Tensor | None = None,
     ) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,), at the times of `offer`, below
-        items (B, P) of the same list, −1 for none; see `scores`."""
+        items (B, P) of the same list, −1 for none; see `scores` and `tastes_after`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
         added = added + self.sum_running(offer, items)
@@ -234,7 +226,7 @@ class ItemRewardModel(nn.Module):
         column, user_rows = items.unsqueeze(1), self._user_rows(users, items)
         exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), column)
         exposure = exposure + ((earlier == column) * repeated).sum(1)
-        tastes = self.tastes_after(history)
+        tastes = self.tastes_after(history, users, sums)
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
         fixed = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
         return fixed + x @ self.state + added
@@ -260,15 +252,34 @@ class ItemRewardModel(nn.Module):
         interaction = self.standardise(states) @ self.interaction
         return self.affinity[self._user_rows(users, states)] + tastes[:, 1:] + interaction
 
-    def tastes_after(self, history: Shown) -> Tensor:
-        """What sessions showed of their users' level and affinity, (B, D + 1)."""
-        if not self.tastes.are_known:
+    def tastes_after(
+        self,
+        history: Shown,
+        users: Tensor | None,
+        sums: Tensor | None = None,
+    ) -> Tensor:
+        """Level and affinity (B, D + 1) that sessions, and earlier rows of their users (B,), show;
+        `sums` (B, D + 2) of `sums_before` take the place of both."""
+        items, rewards = history.latest(MEMORY)
+        if self.tastes.are_known:
+            return cast("Tensor", self.tastes(items, self.vectors, self.target(rewards)))
+        if not self.interests.are_known:
             # The length of a tensor would be that of one batch in a graph that is exported.
             size = history.items.shape[0], self.vectors.shape[1] + 1
             return torch.zeros(size, device=self.item.device)
-        items, rewards = history.latest(MEMORY)
-        part: Tensor = self.tastes(items, self.vectors, self.target(rewards))
-        return part
+        if sums is None:
+            in_training = self.interests.sums[self._user_rows(users, items)]
+            sums = in_training + self.sum_rows(items, self.target(rewards))
+        return self.interests.rates(sums) * self.interests.weights
+
+    def sum_rows(self, items: Tensor, targets: Tensor) -> Tensor:
+        """See `Interests.sum_rows`."""
+        return self.interests.sum_rows(items, targets, self.vectors, self.binary)
+
+    def sums_before(self, users: Tensor, times: Tensor) -> Tensor:
+        """(M, D + 2) what interests of users (M,) before times (M,) come from, in `user_rows`."""
+        assert self.user_rows is not None
+        return self.user_rows.sums_before(users, times, self.sum_rows)
 
     def expect(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""
@@ -278,7 +289,9 @@ class ItemRewardModel(nn.Module):
 
     @torch.no_grad()
     def set_effects(
-        self, effects: Mapping[str, Tensor], sum_content: Callable[[Tensor], Tensor]
+        self,
+        effects: Mapping[str, Tensor],
+        sum_content: Callable[[Tensor], Tensor],
     ) -> None:
         """Set the fitted effects, those of `EFFECTS` by name; missing ones become 0, and effects of
         content those (n_items,) of the items' tags and embeddings."""
@@ -291,7 +304,8 @@ class ItemRewardModel(nn.Module):
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
             self.item.add_(sum_content(effects["content"]))
-        self.tastes.weigh(effects.get("tastes", 0.0))
+        self.tastes.weigh(effects.get("tastes", torch.zeros(())))
+        self.interests.weigh(effects.get("interest", torch.zeros(())))
         self.eval()
 
     def target(self, rewards: Tensor) -> Tensor:

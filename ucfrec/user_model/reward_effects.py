@@ -23,10 +23,9 @@ from ucfrec.user_model.reward import (
 )
 from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
-EFFECTS = (
-    *("running", "item", "user", "content", "affinity", "position", "above"),
-    *("tastes", "exposure", "context", "state", "interaction"),
-)
+LASTING = ("running", "item", "interest", "user", "content", "affinity", "position", "above")
+"""Effects that are distinguished by users who were shown several items."""
+EFFECTS = (*LASTING, "tastes", "exposure", "context", "state", "interaction")
 """In the order in which they are added to the model."""
 _ITERATIONS = 100
 _HISTORY = 10
@@ -45,19 +44,12 @@ CHEAP = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
 _STRIDES = {**dict.fromkeys(CHEAP, (2, 1)), "tastes": ()}
 """Steps of the search of a spread, (2,) for others; one number alone needs no search."""
-_LEAST_KNOWN = 0.1
-"""Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
-LASTING = ("running", "item", "user", "content", "affinity", "position", "above")
-"""Effects that are distinguished by users who were shown several items."""
 _FIXED = ("running", "item", "content", "position", "above")
 """Those of items and of lists, which stay as they are where users are forgotten."""
-_SHARED = ("exposure", "running", "state", "position", "above")
+_SHARED = ("exposure", "running", "state", "position", "above", "interest")
 """Effects of numbers of a row, whatever its item."""
-_OF_VECTORS = ("content", "affinity")
-"""Effects of items' vectors that are found before these are turned."""
-_TURNS = 8
 _ROWS = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
 
@@ -96,6 +88,9 @@ class Design:
     position: Tensor
     above: Tensor
     """What `list_inputs` give; (M, 0) where there are no lists."""
+    interest: Tensor
+    """(M, D + 1) products of the users' rates and (1, vector) of the items, see `Interests`; (M, 0)
+    where users are not followed."""
     tastes: Tensor
     """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
@@ -117,7 +112,7 @@ class Design:
         is_known = (rows.users >= 0) & (rows.users < last)
         position, above = list_inputs(likeness, rows.above, rows.items)
         none = torch.zeros(len(rows), 0)
-        return cls(
+        design = cls(
             items=rows.items,
             users=torch.where(is_known, rows.users, last),
             x=x,
@@ -136,8 +131,12 @@ class Design:
             else model.rates.inputs(rows.offer, rows.items),
             position=position if rows.above.shape[1] else none,
             above=above if rows.above.shape[1] else none,
+            interest=none,
             tastes=torch.zeros(len(rows)),
         )
+        if model.user_rows is None:
+            return design
+        return design.add_interests(model, model.sums_before(rows.users, rows.times))
 
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
@@ -145,9 +144,10 @@ class Design:
         names = [part.name for part in dataclasses.fields(self) if part.name not in of_items]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
-    def turned(self, turn: Tensor) -> "Design":
-        """The same rows with the vectors of items times a matrix (D, D)."""
-        return replace(self, vectors=self.vectors @ turn, rows=self.rows @ turn)
+    def add_interests(self, model: ItemRewardModel, sums: Tensor) -> "Design":
+        """The same rows, of users with `sums` (M, D + 2) of what they were shown until then."""
+        inputs = F.pad(self.rows, (1, 0), value=1.0)
+        return replace(self, interest=model.interests.rates(sums) * inputs)
 
     def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
@@ -409,9 +409,6 @@ class EffectSearch:
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
     """For new users: the model, whose `tastes` are set, and what training and held-out rows saw."""
 
-    follows_tastes = False
-    """Whether the vectors of items are turned by how users differ."""
-
     def __init__(
         self,
         design: Design,
@@ -425,8 +422,6 @@ class EffectSearch:
             design, held_out = design.select(~chooses), design.select(chooses)
         self.design, self.held_out, self._begin = design, held_out, begin
         self.effects = design.mean_effect()
-        self.turn = torch.eye(design.vectors.shape[1])
-        """(D, D) by which the vectors of items have been multiplied."""
         self.kept: dict[str, int] = {}
         """Numbers of the spreads of the effects that are part of the model."""
         self.new_users = False
@@ -440,13 +435,6 @@ class EffectSearch:
     def _spreads(self) -> dict[str, float]:
         left_out = LASTING if self.new_users else ()
         return {name: _SPREADS[n] for name, n in self.kept.items() if name not in left_out}
-
-    @property
-    def of_new_users(self) -> bool:
-        """Whether hardly any held-out row is of a user with training rows."""
-        trained = self._find_trained()
-        share = float(trained[self.held_out.users].float().mean())
-        return bool(trained.any()) and share < _LEAST_KNOWN
 
     def _find_trained(self) -> Tensor:
         """(n_users + 1,) bool: users with training rows."""
@@ -479,35 +467,6 @@ class EffectSearch:
             self.item_loss = float(losses.mean())
         if gain > error:
             self.effects, self.losses, self.kept[name] = effects, losses, number
-            if name == "affinity" and self.follows_tastes:
-                self._follow_tastes()
-
-    def _follow_tastes(self) -> None:
-        """Turn the vectors of items so that users differ in every direction alike, as long as this
-        lowers the held-out loss: few directions tell what most users like, such as a category.
-        Undone if the loss is not lower by more than its error in the end."""
-        states = [(*self._state(), self.kept["affinity"])]
-        while len(states) <= _TURNS:
-            root = root_of_tastes(self.effects["affinity"][self._find_trained()], self.design.rows)
-            self._multiply_vectors(root)
-            # Effects of the former vectors are not where a fit with others begins.
-            self.effects = {n: e for n, e in self.effects.items() if n not in _OF_VECTORS}
-            best = self._find_best("affinity", states[-1][-1], (1,))
-            if best[2].mean() >= self.losses.mean():
-                break
-            number, self.effects, self.losses = best
-            states.append((*self._state(), number))
-        gain, error = mean_gain(states[0][-2], states[-1][-2])
-        last = states[-1 if gain > error else 0]
-        self.design, self.held_out, self.turn, self.effects, self.losses, number = last
-        self.kept["affinity"] = number
-
-    def _state(self) -> tuple[Design, Design, Tensor, Effects, Tensor]:
-        return self.design, self.held_out, self.turn, self.effects, self.losses
-
-    def _multiply_vectors(self, root: Tensor) -> None:
-        self.turn = self.turn @ root
-        self.design, self.held_out = self.design.turned(root), self.held_out.turned(root)
 
     def adjust(self) -> None:
         """Choose the spreads of the effects found so far again, each given the others."""
@@ -546,12 +505,12 @@ class EffectSearch:
             usual = usual + self.design.sum_content(self.effects["content"])
         model.tastes.usual.copy_(torch.sigmoid(usual) if self.design.binary else usual)
         model.tastes.root.copy_(root)
-        model.tastes.weigh(1.0)
+        model.tastes.weigh(torch.ones(()))
 
         def add_tastes(design: Design, history: Shown) -> Design:
             parts = []
             for part in torch.split(torch.arange(len(design.items)), _ROWS):
-                tastes = model.tastes_after(history.at(part))
+                tastes = model.tastes_after(history.at(part), None)
                 parts.append(tastes[:, 0] + (tastes[:, 1:] * design.rows[part]).sum(1))
             return replace(design, tastes=torch.cat(parts))
 
@@ -610,8 +569,6 @@ class EffectSearch:
     ) -> None:
         """Write the model with the effects found, its report, and the effects beside it; `file` is
         complete last."""
-        model.vectors.copy_(self.design.vectors)
-        model.turn.copy_(model.turn @ self.turn)
         model.set_effects(self.effects, self.design.sum_content)
         file.parent.mkdir(parents=True, exist_ok=True)
         save_tensors(place_effects(file), self.effects, {})

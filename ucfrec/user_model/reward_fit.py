@@ -22,6 +22,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.processes import progress
+from ucfrec.user_model.interest import UserRows
 from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import (
     CHEAP,
@@ -52,6 +53,10 @@ _MAX_STEPS = 100_000
 _WARM_ROWS = 25_000
 """Most rows of a search that begins near an earlier one."""
 _CONSTANT = 1e-6
+_LEAST_KNOWN = 0.1
+"""Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
+_SPREAD = 0.4
+"""Of effects of items and users where they only tell what items usually get."""
 _FOLDS = 5
 """Parts of the decisions, each predicted by a fit to the others."""
 
@@ -105,23 +110,23 @@ def fit_item_reward_model(
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / FITTED
     if file.exists():
         return model, _read_fit(file, model, ItemRewardReport)
-    rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
-    _take_turn(model, first, FITTED)
+    views = train, validation
+    rows, held_out = (RewardRows.of(view, model.lags, _MAX_ROWS, seed) for view in views)
     set_statistics(model, rows, held_out, train)
-    design = Design.of(model, rows)
+    design, new_users = Design.of(model, rows), _are_new(rows, held_out)
+    if not new_users:
+        design = _follow_users(model, design, train, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
-    if search.of_new_users:
-        rows, held_out = (RewardRows.of(v, MEMORY, _MAX_ROWS, seed) for v in (train, validation))
+    if new_users:
+        rows, held_out = (RewardRows.of(view, MEMORY, _MAX_ROWS, seed) for view in views)
         search.sessions = model, rows.history, held_out.history
     elif begin.effects:
         search = EffectSearch(_select_some(design, seed), search.held_out, begin)
-    else:
-        search.follows_tastes = True
     none = rows.rewards.new_zeros(0)  # the design has what it needs of states and history
     rows = replace(rows, states=none, history=Shown(none, none))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
-        lasting = EffectSearch(design, None, begin) if search.of_new_users else search
+        lasting = EffectSearch(design, None, begin) if new_users else search
         for name in EFFECTS:
             if name not in LASTING and lasting is not search:
                 search.take(lasting)
@@ -131,7 +136,7 @@ def fit_item_reward_model(
             if name == CHEAP[-1] and not begin.effects:
                 lasting.adjust()
             bar.update()
-        if search.follows_tastes:
+        if not (new_users or begin.effects):
             search.adjust()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
@@ -157,11 +162,12 @@ def refit_item_reward_model(
     tensors, metadata = load_tensors(first / FITTED)
     report = ItemRewardReport(**metadata)
     model = ItemRewardModel(reward_model_sizes(store))
-    lags = MEMORY if "tastes" in report.kept else model.lags
+    lags = MEMORY if report.new_users else model.lags
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
-    _take_turn(model, first, FITTED)
     set_statistics(model, rows, rows, store)
     design = Design.of(model, rows)
+    if not report.new_users:
+        design = _follow_users(model, design, store, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     if report.new_users:
@@ -276,12 +282,39 @@ def set_statistics(
     exact = states.embeddings.double().sub_(mean)
     length = exact[rows.items].square_().sum(1).mean().sqrt()
     model.vectors.copy_(exact.div_(length.clamp(min=_CONSTANT)))
-    model.vectors.copy_(model.vectors @ model.turn)
     model.likeness.start_from(states)
     model.rates = RunningRates.of(train, model.target)
     if model.rates is not None:
         last = torch.tensor([train.column(schema.TIMESTAMP).max()])
         model.latest.copy_(model.rates.rates[model.rates.bins.rows(last)[0]])
+
+
+def _follow_users(
+    model: ItemRewardModel,
+    design: Design,
+    train: EpisodeStore,
+    rows: RewardRows,
+) -> Design:
+    """The design of `rows` with the interests of users, if these are named; sets what items usually
+    get, and what users were shown at every time and at the end of training."""
+    logged = UserRows.of(train, model.target)
+    if logged is None:
+        return design
+    effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))
+    usual = effects["mean"] + effects["item"]
+    model.interests.usual.copy_(torch.sigmoid(usual) if design.binary else usual)
+    users, end = torch.arange(len(model.user) - 1), logged.begin + logged.span
+    at_end = logged.sums_before(users, torch.full(users.shape, end), model.sum_rows)
+    model.interests.sums[:-1] = at_end
+    model.user_rows = UserRows.of(train.whole, model.target)
+    return design.add_interests(model, model.sums_before(rows.users, rows.times))
+
+
+def _are_new(rows: RewardRows, held_out: RewardRows) -> bool:
+    """Whether hardly any held-out row is of a user with training rows, of whom there are some."""
+    trained = torch.unique(rows.users[rows.users >= 0])
+    share = float(torch.isin(held_out.users, trained).float().mean())
+    return bool(len(trained)) and share < _LEAST_KNOWN
 
 
 def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]) -> _Report:
@@ -290,13 +323,6 @@ def _read_fit(file: Path, model: ItemRewardModel, report: Callable[..., _Report]
     model.eval()
     with damage_explained(file, REMEDY):
         return report(**metadata)
-
-
-def _take_turn(model: ItemRewardModel, first: Path | None, name: str) -> None:
-    """Turn the vectors as an earlier fit in a folder did, if there is one."""
-    if first is not None and (file := first / name).exists():
-        with damage_explained(file, REMEDY):
-            model.turn.copy_(load_tensors(file)[0]["turn"])
 
 
 def _select_some(design: Design, seed: int) -> Design:

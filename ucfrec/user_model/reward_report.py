@@ -34,6 +34,8 @@ class RewardRows:
     items: Tensor
     users: Tensor
     """(M,) int64 numbers in the store; −1 if the store does not name its users."""
+    times: Tensor
+    """(M,) int64 ms of the decisions; (0,) if the store does not have them."""
     history: Shown
     """The items shown earlier in the session, (M, lags)."""
     states: Tensor
@@ -78,10 +80,15 @@ class RewardRows:
         users = np.full(view.n_episodes, -1)
         if view.has_users:
             users = view.episode_values(schema.USER).astype(np.int64)
+        starts = view.decision_starts(episodes, steps)
+        times = np.zeros(0)
+        if schema.TIMESTAMP in view.record.columns:
+            times = view.step_values(schema.TIMESTAMP, episodes, starts)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
-            Shown.before(view, episodes, view.decision_starts(episodes, steps), lags),
+            torch.from_numpy(times.astype(np.int64)),
+            Shown.before(view, episodes, starts, lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
@@ -188,6 +195,8 @@ class ItemRewardReport:
 
 def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     """Linear predictors (M,) of the items shown in `rows`."""
+    follows = model.interests.are_known and model.user_rows is not None
+    sums = model.sums_before(rows.users, rows.times) if follows else None
     scores = [
         model.score(
             rows.states[part],
@@ -196,6 +205,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.items[part],
             rows.offer and rows.offer.change(itemgetter(part)),
             rows.above[part],
+            None if sums is None else sums[part],
         )
         for part in torch.split(torch.arange(len(rows)), _CHUNK)
     ]

@@ -1,0 +1,146 @@
+"""Interests are what users were shown until the decision, in training as in serving."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn import functional as F
+
+import ucfrec.user_model.interest as module
+from ucfrec import EpisodeStore
+from ucfrec.episodes.states import ItemStates
+from ucfrec.user_model.interest import Interests, UserRows
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
+from ucfrec.user_model.reward_report import RewardRows, score_rows
+
+USERS, SESSIONS, STEPS, ITEMS, SIZE = 150, 4, 6, 20, 3
+
+
+def log_of(binary: bool, named: bool = True) -> EpisodeStore:
+    """Users like items in a direction of their own, and come back; their last session is held out.
+    Items are of one kind in two of three directions."""
+    rng = np.random.default_rng(3)
+    embeddings = rng.normal(size=(ITEMS, SIZE)) * [2.0, 1.0, 0.3]
+    shape = USERS, SESSIONS, STEPS
+    items = rng.integers(ITEMS, size=shape)
+    tastes = rng.normal(size=(USERS, SIZE)) * [1.2, 0.0, 0.0]
+    odds = np.einsum("usni,ui->usn", embeddings[items], tastes) + rng.normal(size=ITEMS)[items]
+    rewards = odds + rng.normal(size=shape)
+    if binary:
+        rewards = 1.0 * (rng.random(shape) < 1 / (1 + np.exp(-odds)))
+    hours = rng.random((USERS, 1, 1)) + 30 * np.arange(SESSIONS)[:, None] + 0.1 * np.arange(STEPS)
+    columns = {"item": items.ravel(), "reward": rewards.ravel()}
+    columns["timestamp"] = (3_600_000 * hours).astype(np.int64).ravel()
+    episodes = {"split": np.tile(np.repeat([0, 1], [SESSIONS - 1, 1]), USERS)}
+    if named:
+        episodes["user"] = np.repeat(np.arange(USERS), SESSIONS)
+    vectors = torch.from_numpy(embeddings).float()
+    states = ItemStates(vectors, torch.zeros(USERS, 0), float(rewards.min()), float(rewards.max()))
+    return EpisodeStore.from_arrays(columns, np.full(USERS * SESSIONS, STEPS), episodes, states)
+
+
+def fitted(binary: bool, folder: Path) -> tuple[ItemRewardModel, EpisodeStore]:
+    store = log_of(binary)
+    train, validation = store.split("train"), store.split("validation")
+    model, report = fit_item_reward_model(train, validation, folder, 0)
+    assert "interest" in report.kept
+    assert report.loss < report.item_loss - 0.02
+    return model, validation
+
+
+@pytest.mark.parametrize("at_once", [7, 2**16])
+@pytest.mark.parametrize("binary", [True, False])
+def test_sums_are_those_of_a_users_earlier_rows(
+    binary: bool, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_AT_ONCE", at_once)
+    view = log_of(binary).select(np.arange(40))
+    model = ItemRewardModel({"state": 2, "action": SIZE, "items": ITEMS, "users": USERS})
+    for name in ("vectors", "interests.usual"):
+        model.get_buffer(name).uniform_(0.1, 0.9)
+    model.binary.fill_(binary)
+    rows = UserRows.of(view, lambda rewards: rewards)
+    assert rows is not None
+    names = "item", "reward", "timestamp"
+    items, rewards, times = (torch.from_numpy(view.column(name)) for name in names)
+    of_row = torch.arange(40 * STEPS) // (SESSIONS * STEPS)
+    users, moments = torch.tensor([0, 3, 9, -1, 140, 5]), times[[0, 40, 3, 9, 50, -1]] + 1
+    found = rows.sums_before(users, moments, model.sum_rows)
+    for user, moment, sums in zip(users, moments, found, strict=True):
+        some = (of_row == user) & (times < moment)
+        usual = model.interests.usual[items[some].long()]
+        unusual = (rewards[some] - usual).unsqueeze(1)
+        variance = usual * (1 - usual) if binary else torch.ones_like(usual)
+        expected = [unusual.sum(0), (unusual * model.vectors[items[some].long()]).sum(0)]
+        torch.testing.assert_close(sums, torch.cat([*expected, variance.sum().view(1)]).float())
+    assert not found[3].any()
+    assert not found[4].any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(length=st.integers(0, 20), seed=st.integers(0, 99), binary=st.booleans())
+def test_neither_order_nor_padding_matters(length: int, seed: int, binary: bool) -> None:
+    random = torch.Generator().manual_seed(seed)
+    interests, vectors = Interests(1, ITEMS, SIZE), torch.randn(ITEMS, SIZE, generator=random)
+    interests.usual.copy_(torch.rand(ITEMS, generator=random))
+    items = torch.randint(-1, ITEMS, (3, length), generator=random)
+    targets, order = torch.rand(3, length), torch.randperm(length, generator=random)
+
+    def rates(items: Tensor, targets: Tensor) -> Tensor:
+        sums = interests.sum_rows(items, targets, vectors, torch.tensor(binary))
+        return interests.rates(sums)
+
+    found = rates(items, targets)
+    padded = rates(F.pad(items, (2, 3), value=-1), F.pad(targets, (2, 3), value=9.0))
+    for other in (rates(items[:, order], targets[:, order]), padded):
+        torch.testing.assert_close(other, found, rtol=1e-4, atol=1e-4)
+    # What is as usual tells nothing.
+    assert not rates(items, interests.usual[items.clamp(min=0)]).any()
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_what_is_fitted_is_what_is_served(binary: bool, tmp_path: Path) -> None:
+    model, validation = fitted(binary, tmp_path)
+    rows = RewardRows.of(validation, model.reach, 10**6, 0)
+    followed = score_rows(model, rows)
+    read = fit_item_reward_model(validation, validation, tmp_path, 0)[0]
+    assert read.user_rows is None
+    torch.testing.assert_close(score_rows(read, rows), followed, atol=2e-5, rtol=1e-4)
+    # Scores of all items have them, too.
+    every = read.scores(rows.states, rows.history, rows.users)
+    of_rows = every.gather(1, rows.items.unsqueeze(1)).squeeze(1)
+    torch.testing.assert_close(of_rows, followed, atol=2e-5, rtol=1e-4)
+
+
+def test_a_click_raises_items_like_it_at_once(tmp_path: Path) -> None:
+    model, validation = fitted(True, tmp_path)
+    model.user_rows = None
+    for name in ("state", "interaction", "exposure"):
+        model.get_buffer(name).zero_()
+    rows = RewardRows.of(validation, model.reach, 10**6, 0)
+    unknown = torch.full_like(rows.users, -1)
+    before, after = (model.scores(rows.states, rows.history.latest(n), unknown) for n in (0, STEPS))
+    assert torch.equal(before, before[:1].expand_as(before))
+    liked = (rows.history.rewards[:, :STEPS] * 2 - 1) * (rows.history.items[:, :STEPS] >= 0)
+    first = validation.item_states.embeddings[:, 0]
+    seen = (liked * first[rows.history.items[:, :STEPS].clamp(min=0)]).sum(1)
+    slopes = torch.linalg.lstsq(torch.stack([first, torch.ones(ITEMS)], 1), (after - before).T)
+    assert float(torch.corrcoef(torch.stack([slopes.solution[0], seen]))[0, 1]) > 0.8
+
+
+def test_a_refit_follows_users_too_and_unnamed_ones_have_no_interests(tmp_path: Path) -> None:
+    model, _ = fitted(True, tmp_path / "first")
+    store = log_of(True)
+    again = refit_item_reward_model(tmp_path / "first", store.whole, tmp_path / "second", 0)
+    # Held-out rows count now: a fourth of all.
+    ratio = again.interests.sums[:-1, -1].sum() / model.interests.sums[:-1, -1].sum()
+    assert float(ratio) == pytest.approx(SESSIONS / (SESSIONS - 1), rel=0.02)
+    unnamed = log_of(True, named=False)
+    views = unnamed.split("train"), unnamed.split("validation")
+    _, report = fit_item_reward_model(*views, tmp_path / "unnamed", 0)
+    assert "interest" not in {entry.effect for entry in report.effects}

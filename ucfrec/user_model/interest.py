@@ -1,0 +1,137 @@
+"""Interests of users: what they rewarded more than others do, until a decision."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ucfrec import schema
+from ucfrec.arrays import IntArray
+from ucfrec.episodes.store import EpisodeStore
+
+_PRIOR = 4.0
+"""Rows of a variance of 1 that are added to those of a user."""
+_AT_ONCE = 2**16
+
+
+class Weighted(nn.Module):
+    """What users have shown, which counts with weights in scores."""
+
+    def __init__(self, *shape: int) -> None:
+        super().__init__()
+        self.weights = nn.Buffer(torch.zeros(shape))
+        self.are_known = False
+        """Whether any weight differs from 0, a number that graphs can be exported with."""
+
+    def weigh(self, weights: Tensor) -> None:
+        """Set the weights, or a scalar for all."""
+        self.weights.copy_(weights.expand_as(self.weights))
+        self.are_known = bool(self.weights.any())
+
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        super()._load_from_state_dict(*arguments, **options)
+        self.weigh(self.weights)
+
+
+class Interests(Weighted):
+    """Running rates of user × attribute: what a user adds to the scores of items with a vector.
+
+    Of the rows r of a user until a decision, t_r is the target, t̄_r what its item usually gets, and
+    v_r the variance of such a target: the user's rates are (Σ (t_r − t̄_r) (1, e_r)) / (Σ v_r + 4),
+    e_r being the vector of the item. Weights turn these D + 1 numbers into level and affinity.
+    """
+
+    def __init__(self, users: int, items: int, embedding_size: int) -> None:
+        super().__init__(embedding_size + 1)
+        self.usual = nn.Buffer(torch.zeros(items))
+        """What every item usually gets, as `ItemRewardModel.target`."""
+        self.sums = nn.Buffer(torch.zeros(users, embedding_size + 2))
+        """Sums of `sum_rows` of the training rows of every user."""
+
+    def sum_rows(
+        self,
+        items: Tensor,
+        targets: Tensor,
+        vectors: Tensor,
+        binary: Tensor,
+    ) -> Tensor:
+        """Sums (B, D + 2) over the rows of users: of (t − t̄) (1, e), and of v.
+
+        Args:
+            items: (B, N) int64, −1 for none.
+            targets: (B, N) what they earned, from 0 to 1 if `binary`, or standardised.
+            vectors: (n_items, D) of all items.
+        """
+        valid, items = items >= 0, items.clamp(min=0)
+        usual = self.usual[items]
+        unusual = ((targets - usual) * valid).unsqueeze(1)
+        variance = torch.where(binary, usual * (1 - usual), 1.0) * valid
+        of_vectors = (unusual @ vectors[items]).squeeze(1)
+        return torch.cat([unusual.sum(2), of_vectors, variance.sum(1, keepdim=True)], 1)
+
+    def rates(self, sums: Tensor) -> Tensor:
+        """Rates (B, D + 1) of users with these sums (B, D + 2)."""
+        return sums[:, :-1] / (sums[:, -1:] + _PRIOR)
+
+
+@dataclass(frozen=True)
+class UserRows:
+    """The rows of a view of a store of items, by user and time."""
+
+    keys: IntArray
+    """(N,) ascending: the user's number times `span`, plus the time."""
+    items: Tensor
+    targets: Tensor
+    """(N,) int64 and float32, as of `Interests.sum_rows`."""
+    begin: int
+    span: int
+
+    @classmethod
+    def of(
+        cls,
+        view: EpisodeStore,
+        target: Callable[[Tensor], Tensor],
+    ) -> "UserRows | None":
+        """The rows of a view, whose rewards `target` turns into what is predicted; None if it names
+        no users or times."""
+        if not view.has_users or schema.TIMESTAMP not in view.record.columns:
+            return None
+        users = view.episode_values(schema.USER).astype(np.int64)[view.all_steps()[0]]
+        names = schema.TIMESTAMP, schema.ITEM, schema.REWARD
+        times, items, rewards = (view.column(name) for name in names)
+        begin, span = int(times.min()), int(np.ptp(times)) + 2
+        keys = users * span + times - begin
+        order = np.argsort(keys, kind="stable")
+        order = order[(users[order] >= 0) & (items[order] >= 0)]
+
+        if not len(order):
+            return None
+        targets = target(torch.from_numpy(rewards[order]))
+        return cls(keys[order], torch.from_numpy(items[order]).long(), targets, begin, span)
+
+    def sums_before(
+        self,
+        users: Tensor,
+        times: Tensor,
+        sum_rows: Callable[[Tensor, Tensor], Tensor],
+    ) -> Tensor:
+        """Sums (M, D + 2) of the rows of users (M,), −1 for none, before times (M,), int64 ms."""
+        first = users.numpy() * self.span
+        last = first + (times.numpy() - self.begin).clip(0, self.span - 1)
+        places = [np.searchsorted(self.keys, keys) for keys in (first, last)]
+        sums = total = torch.zeros(1, dtype=torch.float64)
+        for start in range(0, len(self.keys), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            rows = sum_rows(self.items[part].unsqueeze(1), self.targets[part].unsqueeze(1))
+            if not start:
+                total = rows.new_zeros(1, rows.shape[1], dtype=torch.float64)
+                sums = total.repeat(len(users), 1)
+            totals = torch.cat([total, total + rows.double().cumsum(0)])
+            for sign, at in zip((-1, 1), places, strict=True):
+                found = np.flatnonzero((at > start) & (at <= start + len(rows)))
+                sums[found] += sign * totals[at[found] - start]
+            total = totals[-1:]
+        return sums.float()

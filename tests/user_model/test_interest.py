@@ -5,15 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from torch import Tensor
-from torch.nn import functional as F
 
 import ucfrec.user_model.interest as module
 from ucfrec import EpisodeStore
 from ucfrec.episodes.states import ItemStates
-from ucfrec.user_model.interest import Interests, UserRows
+from ucfrec.user_model.interest import UserRows
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_report import RewardRows, score_rows
@@ -80,27 +76,6 @@ def test_sums_are_those_of_a_users_earlier_rows(
         torch.testing.assert_close(sums, torch.cat([*expected, variance.sum().view(1)]).float())
     assert not found[3].any()
     assert not found[4].any()
-
-
-@settings(max_examples=30, deadline=None)
-@given(length=st.integers(0, 20), seed=st.integers(0, 99), binary=st.booleans())
-def test_neither_order_nor_padding_matters(length: int, seed: int, binary: bool) -> None:
-    random = torch.Generator().manual_seed(seed)
-    interests, vectors = Interests(1, ITEMS, SIZE), torch.randn(ITEMS, SIZE, generator=random)
-    interests.usual.copy_(torch.rand(ITEMS, generator=random))
-    items = torch.randint(-1, ITEMS, (3, length), generator=random)
-    targets, order = torch.rand(3, length), torch.randperm(length, generator=random)
-
-    def rates(items: Tensor, targets: Tensor) -> Tensor:
-        sums = interests.sum_rows(items, targets, vectors, torch.tensor(binary))
-        return interests.rates(sums)
-
-    found = rates(items, targets)
-    padded = rates(F.pad(items, (2, 3), value=-1), F.pad(targets, (2, 3), value=9.0))
-    for other in (rates(items[:, order], targets[:, order]), padded):
-        torch.testing.assert_close(other, found, rtol=1e-4, atol=1e-4)
-    # What is as usual tells nothing.
-    assert not rates(items, interests.usual[items.clamp(min=0)]).any()
 
 
 @pytest.mark.parametrize("binary", [True, False])

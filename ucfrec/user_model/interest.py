@@ -15,16 +15,17 @@ from ucfrec.episodes.store import EpisodeStore
 _PRIOR = 4.0
 """Rows of a variance of 1 that are added to those of a user."""
 _AT_ONCE = 2**16
+"""Rows that are summed at once."""
 
 
 class Weighted(nn.Module):
-    """What users have shown, which counts with weights in scores."""
+    """What users have shown, which counts in scores with weights."""
 
     def __init__(self, *shape: int) -> None:
         super().__init__()
         self.weights = nn.Buffer(torch.zeros(shape))
         self.are_known = False
-        """Whether any weight differs from 0, a number that graphs can be exported with."""
+        """Whether any weight differs from 0: a graph that is exported cannot ask a tensor."""
 
     def weigh(self, weights: Tensor) -> None:
         """Set the weights, or a scalar for all."""

@@ -161,6 +161,14 @@ def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> No
     unlikely, hitting = (replace(high, evidence=RuleEvidence(0.3, each)) for each in (0.1, 0.2))
     assert search.most_evident([unlikely, likely]) == likely
     assert search.most_evident([likely, hitting]) == hitting
+    # Or what it says of their values, less their errors, if it can evaluate both.
+    low, high = (
+        replace(rule, evidence=RuleEvidence(0.1, 0.1, users, 0.0, value, 0.2))
+        for rule, users, value in ((low, 300.0, 1.5), (high, 900.0, 1.4))
+    )
+    assert search.most_evident([low, high]) == high
+    search.least_users = 200.0
+    assert search.most_evident([low, high]) == low
 
 
 def test_rules_far_behind_are_not_simulated_in_all_sessions(trained: TrainedPolicy) -> None:

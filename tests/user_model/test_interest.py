@@ -17,9 +17,8 @@ from ucfrec.user_model.reward_report import RewardRows, score_rows
 USERS, SESSIONS, STEPS, ITEMS, SIZE = 150, 4, 6, 20, 3
 
 
-def log_of(binary: bool, named: bool = True) -> EpisodeStore:
-    """Users like items in a direction of their own, and come back; their last session is held out.
-    Items are of one kind in two of three directions."""
+def log_of(binary: bool) -> EpisodeStore:
+    """Users like items in a direction of their own; their last session is held out."""
     rng = np.random.default_rng(3)
     embeddings = rng.normal(size=(ITEMS, SIZE)) * [2.0, 1.0, 0.3]
     shape = USERS, SESSIONS, STEPS
@@ -33,8 +32,7 @@ def log_of(binary: bool, named: bool = True) -> EpisodeStore:
     columns = {"item": items.ravel(), "reward": rewards.ravel()}
     columns["timestamp"] = (3_600_000 * hours).astype(np.int64).ravel()
     episodes = {"split": np.tile(np.repeat([0, 1], [SESSIONS - 1, 1]), USERS)}
-    if named:
-        episodes["user"] = np.repeat(np.arange(USERS), SESSIONS)
+    episodes["user"] = np.repeat(np.arange(USERS), SESSIONS)
     vectors = torch.from_numpy(embeddings).float()
     states = ItemStates(vectors, torch.zeros(USERS, 0), float(rewards.min()), float(rewards.max()))
     return EpisodeStore.from_arrays(columns, np.full(USERS * SESSIONS, STEPS), episodes, states)
@@ -86,7 +84,6 @@ def test_what_is_fitted_is_what_is_served(binary: bool, tmp_path: Path) -> None:
     read = fit_item_reward_model(validation, validation, tmp_path, 0)[0]
     assert read.user_rows is None
     torch.testing.assert_close(score_rows(read, rows), followed, atol=2e-5, rtol=1e-4)
-    # Scores of all items have them, too.
     every = read.scores(rows.states, rows.history, rows.users)
     of_rows = every.gather(1, rows.items.unsqueeze(1)).squeeze(1)
     torch.testing.assert_close(of_rows, followed, atol=2e-5, rtol=1e-4)
@@ -108,14 +105,10 @@ def test_a_click_raises_items_like_it_at_once(tmp_path: Path) -> None:
     assert float(torch.corrcoef(torch.stack([slopes.solution[0], seen]))[0, 1]) > 0.8
 
 
-def test_a_refit_follows_users_too_and_unnamed_ones_have_no_interests(tmp_path: Path) -> None:
+def test_a_refit_follows_users_too(tmp_path: Path) -> None:
     model, _ = fitted(True, tmp_path / "first")
     store = log_of(True)
     again = refit_item_reward_model(tmp_path / "first", store.whole, tmp_path / "second", 0)
-    # Held-out rows count now: a fourth of all.
+    # Held-out rows count, too.
     ratio = again.interests.sums[:-1, -1].sum() / model.interests.sums[:-1, -1].sum()
     assert float(ratio) == pytest.approx(SESSIONS / (SESSIONS - 1), rel=0.02)
-    unnamed = log_of(True, named=False)
-    views = unnamed.split("train"), unnamed.split("validation")
-    _, report = fit_item_reward_model(*views, tmp_path / "unnamed", 0)
-    assert "interest" not in {entry.effect for entry in report.effects}

@@ -376,9 +376,9 @@ class RuleSearch:
         return min(self.level(candidates), key=_simplicity)
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
-        """Of level rules, the one that the choice starts from, or the one with the most support in
-        the log: effective users, if more than a handful, else the likelihood; then the most hits,
-        in whole percents; then the simplest."""
+        """Of level rules, the one that the choice starts from, or the one that the log prefers: by
+        value less its error, if the log can evaluate it; else by effective users, if more than a
+        handful, else by likelihood; then by hits, in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
         unknown = [candidate for candidate in level if not candidate.evidence]
@@ -388,6 +388,8 @@ class RuleSearch:
             evidence, users = candidate.evidence, candidate.effective_users
             assert evidence is not None
             support = users if users >= _FEWEST else evidence.likelihood
+            if self.least_users and self.is_allowed(candidate):
+                support = (evidence.value or 0.0) - (evidence.error or 0.0)
             return (-support, -round(evidence.hits, 2), *_simplicity(candidate))
 
         return min([*complete, *self._add_evidence(unknown)], key=rank)
@@ -478,7 +480,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
 
     For new users and lists, rules of the highest value are then simulated in more sessions. Of
-    rules that the model cannot distinguish, the one with the most support in the log is taken.
+    rules that the model cannot distinguish, the log decides.
     """
     search, where = RuleSearch(problem), ""
     if (start := problem.start) is None:

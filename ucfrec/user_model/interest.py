@@ -18,7 +18,7 @@ _AT_ONCE = 2**16
 """Rows that are summed at once."""
 
 
-class Weighted(nn.Module):
+class ShownTastes(nn.Module):
     """What users have shown, which counts in scores with weights."""
 
     def __init__(self, *shape: int) -> None:
@@ -37,7 +37,7 @@ class Weighted(nn.Module):
         self.weigh(self.weights)
 
 
-class Interests(Weighted):
+class Interests(ShownTastes):
     """Running rates of user × attribute: what a user adds to the scores of items with a vector.
 
     Of the rows r of a user until a decision, t_r is the target, t̄_r what its item usually gets, and
@@ -83,12 +83,12 @@ class UserRows:
     """The rows of a view of a store of items, by user and time."""
 
     keys: IntArray
-    """(N,) ascending: the user's number times `span`, plus the time."""
+    """(N,) ascending: the user's number times (1 + T), plus the number of the time."""
     items: Tensor
     targets: Tensor
     """(N,) int64 and float32, as of `Interests.sum_rows`."""
-    begin: int
-    span: int
+    times: IntArray
+    """(T,) the distinct times, ascending, int64 ms: their numbers do not overflow in keys."""
 
     @classmethod
     def of(
@@ -102,16 +102,16 @@ class UserRows:
             return None
         users = view.episode_values(schema.USER).astype(np.int64)[view.all_steps()[0]]
         names = schema.TIMESTAMP, schema.ITEM, schema.REWARD
-        times, items, rewards = (view.column(name) for name in names)
-        begin, span = int(times.min()), int(np.ptp(times)) + 2
-        keys = users * span + times - begin
+        logged, items, rewards = (view.column(name) for name in names)
+        times, numbers = np.unique(logged, return_inverse=True)
+        keys = users * (1 + len(times)) + numbers
         order = np.argsort(keys, kind="stable")
         order = order[(users[order] >= 0) & (items[order] >= 0)]
 
         if not len(order):
             return None
         targets = target(torch.from_numpy(rewards[order]))
-        return cls(keys[order], torch.from_numpy(items[order]).long(), targets, begin, span)
+        return cls(keys[order], torch.from_numpy(items[order]).long(), targets, times)
 
     def sums_before(
         self,
@@ -120,8 +120,8 @@ class UserRows:
         sum_rows: Callable[[Tensor, Tensor], Tensor],
     ) -> Tensor:
         """Sums (M, D + 2) of the rows of users (M,), −1 for none, before times (M,), int64 ms."""
-        first = users.numpy() * self.span
-        last = first + (times.numpy() - self.begin).clip(0, self.span - 1)
+        first = users.numpy() * (1 + len(self.times))
+        last = first + np.searchsorted(self.times, times.numpy())
         places = [np.searchsorted(self.keys, keys) for keys in (first, last)]
         sums = total = torch.zeros(1, dtype=torch.float64)
         for start in range(0, len(self.keys), _AT_ONCE):

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.offers import Offer
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.interest import Interests, UserRows, Weighted
+from ucfrec.user_model.interest import Interests, ShownTastes, UserRows
 from ucfrec.user_model.running import AGES, RunningRates, TimeBins
 
 MEMORY = 50
@@ -30,7 +30,7 @@ CLIP = 5.0
 """Standardised states beyond this many standard deviations are clipped."""
 
 
-class UserPosterior(Weighted):
+class UserPosterior(ShownTastes):
     """Tastes of the users of B sessions, from what was shown to them, and its rewards.
 
     Tastes v = (level, affinity) add v · (1, e_i) to the score of an item with the vector e_i, and

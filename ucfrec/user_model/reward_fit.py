@@ -303,7 +303,7 @@ def _follow_users(
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))
     usual = effects["mean"] + effects["item"]
     model.interests.usual.copy_(torch.sigmoid(usual) if design.binary else usual)
-    users, end = torch.arange(len(model.user) - 1), logged.begin + logged.span
+    users, end = torch.arange(len(model.user) - 1), int(logged.times[-1]) + 1
     at_end = logged.sums_before(users, torch.full(users.shape, end), model.sum_rows)
     model.interests.sums[:-1] = at_end
     model.user_rows = UserRows.of(train.whole, model.target)

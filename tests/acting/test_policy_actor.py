@@ -63,9 +63,7 @@ def written(
         ("synthetic-catalog", "item-knn"),
     ],
 )
-def test_logged_windows_give_the_actions_played(
-    environment: str, name: str, tmp_path: Path
-) -> None:
+def test_logged_windows_give_actions_played(environment: str, name: str, tmp_path: Path) -> None:
     env = load_plugin("simulators", environment).make(SIDE_BY_SIDE, None)
     observed = env.single_observation_space.shape[0]
     states = None

@@ -196,6 +196,25 @@ def test_evidence_is_what_off_policy_evaluation_finds(evident: Path) -> None:
     assert found[1].effective_users > found[0].effective_users > found[2].effective_users
 
 
+def test_rows_of_a_list_are_drawn_one_after_the_other(evident: Path, tmp_path: Path) -> None:
+    log = tagged_log().assign(propensity=1 / ITEMS)
+    pairs = ["user_id", log.groupby("user_id").cumcount() // 2]
+    log["timestamp"] = log.groupby(pairs).timestamp.transform("first")
+    log = log[~log.duplicated(["timestamp", "item_id"])]
+    options = {"reward": "reward", "session_by": "user", "embedding_size": 6}
+    view = store_of(log, tmp_path, tagged_mapping(tmp_path), **options).split("validation")
+    rule = DecisionRule(2.0, temperature=0.5)
+    scorer = TrainedPolicy.load(evident / "run").scorer(rule)
+    (found,) = LoggedEvidence(scorer, view, 10**6, 0).evaluate([rule])
+    rows, items = np.arange(view.n_steps), view.column("item").astype(int)
+    logs = rule.log_probabilities(logged_scores(scorer, view, *view.all_steps())).numpy()
+    second = view.column("place") == 1
+    left = -np.expm1(logs[rows, np.roll(items, 1)])[second]
+    expected = logs[rows, items].sum() - np.log(left).sum()
+    assert np.log(found.likelihood) == pytest.approx(expected / len(rows), rel=1e-4)
+    assert second.sum() > 30
+
+
 def test_only_rules_that_the_log_can_evaluate_are_chosen(evident: Path) -> None:
     (_, free), (found, bound) = (choose_by_simulation(problem(evident, n)) for n in (0, 12))
     assert all(each.rule in {one.rule for one in bound} for each in free)

@@ -226,7 +226,7 @@ def test_a_policy_below_the_log_is_warned_of(trained: TrainedPolicy) -> None:
     logged = float(search.problem.train.returns.mean())
     for value, below in ((logged - 0.5, True), (logged - 0.1, False), (logged + 1, False)):
         warning = _warning(search, found, replace(estimate, value=value, error=0.1))
-        assert (f"less than logged sessions have, {logged:.4g}" in warning) == below
+        assert (f"logged sessions have {logged:.4g}, which is more" in warning) == below
 
 
 def test_estimates_are_corrected_by_logged_steps_of_like_expected_reward() -> None:

@@ -82,9 +82,7 @@ def refused(arguments: list[str], capsys: Capsys) -> str:
 
 
 @pytest.mark.parametrize("command", UCFREC.commands)
-def test_help_fits_one_screen(
-    command: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_help_fits_a_screen(command: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     printed = {}
     for word in ("--help", "--help-all"):

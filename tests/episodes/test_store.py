@@ -280,9 +280,7 @@ def store_of(log: pd.DataFrame, gap: int | None) -> EpisodeStore:
 
 
 @given(seed=st.integers(0, 10_000), gap=st.sampled_from([None, GAP]), share=st.floats(0.1, 0.9))
-def test_the_rows_before_a_step_are_those_of_the_user(
-    seed: int, gap: int | None, share: float
-) -> None:
+def test_rows_before_a_step_are_those_of_the_user(seed: int, gap: int | None, share: float) -> None:
     rng = np.random.default_rng(seed)
     log = pd.DataFrame({"user": rng.integers(5, size=40), "item": rng.integers(12, size=40)})
     log["reward"] = rng.integers(2, size=40).astype(float)

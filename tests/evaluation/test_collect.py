@@ -70,9 +70,7 @@ def test_taobao_sessions_have_actions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(clicks, played.returns)
 
 
-def test_no_two_rows_of_a_user_share_a_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_rows_of_a_user_share_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Sessions that start every second and last up to 20 overlap, the more so for 50 users.
     monkeypatch.setattr(module, "SESSION_MS", 1000)
     simulator = synthetic_catalog.SIMULATOR

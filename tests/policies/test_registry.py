@@ -107,9 +107,7 @@ def small_store(path: Path) -> EpisodeStore:
     return EpisodeStore.write(path, columns, np.full(12, 5))
 
 
-def test_the_example_is_installed_and_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_installs_and_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, site = tmp_path / "plugin", tmp_path / "site"
     shutil.copytree(Path(__file__).parents[2] / "examples" / "plugin", source)
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation"]

@@ -118,9 +118,7 @@ def test_a_promotion_killed_at_any_moment_leaves_a_whole_pointer(
     assert current(folder) == "other"
 
 
-def test_a_link_to_a_run_of_another_folder_is_refused(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
+def test_a_link_to_a_run_elsewhere_is_refused(trained: TrainedPolicy, tmp_path: Path) -> None:
     folder = runs(trained, tmp_path / "runs", "a")
     served = tmp_path / "served"
     served.mkdir()

@@ -126,9 +126,7 @@ def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
     assert "reward per step – (the new run: " in describe(found)
 
 
-def test_seen_items_are_compared_as_they_were_served(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
+def test_seen_items_are_compared_as_served(trained: TrainedPolicy, tmp_path: Path) -> None:
     rng, users = np.random.default_rng(0), 400
     items = np.concatenate([rng.permutation(LOGGED_ITEMS)[:5] for _ in range(users)])
     propensity = 1 / (LOGGED_ITEMS - np.tile(np.arange(5), users))

@@ -61,9 +61,7 @@ def test_rates_and_ages_are_those_of_the_rows_before(store: EpisodeStore) -> Non
         assert float(together) == pytest.approx(float(inputs @ weights), abs=1e-5)
 
 
-def test_new_items_are_judged_by_what_they_earned_so_far(
-    store: EpisodeStore, tmp_path: Path
-) -> None:
+def test_new_items_are_judged_by_what_they_earned(store: EpisodeStore, tmp_path: Path) -> None:
     settings = ["train.steps=3", "policy.dim=8", "policy.context=4", "rule.sessions=40"]
     recommender = Recommender("dc", settings=[*settings, "augment.copies=0"])
     trained = recommender.fit(store, tmp_path / "run", refit=True).trained

@@ -70,13 +70,13 @@ class LoggedScores:
         """(M,) logged."""
         self.liked = liked_rewards(view, view.step_values(schema.REWARD, episodes, steps))
         """(M,) bool."""
-        self._scorer = scorer
+        self.scorer = scorer
         self._queries: dict[tuple[object, ...], Query] = {}
 
     @torch.no_grad()
     def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, int, Tensor]]:
         """Of batches of the steps, scores (B, n_items) by each rule: steps, rule, scores."""
-        scorers = [self._scorer.under(rule) for rule in rules]
+        scorers = [self.scorer.under(rule) for rule in rules]
         widest = max(scorers, key=attrgetter("reach"))
         weighted = any(rule.reward_weight for rule in rules)
         with progress(len(self.steps), "logged steps under each rule", "rows") as bar:
@@ -85,7 +85,7 @@ class LoggedScores:
             for first in range(0, len(self.steps), at_once):
                 part = slice(first, first + at_once)
                 episodes, steps = self.episodes[part], self.steps[part]
-                queries = self._queries if self._scorer.has_factors else {}
+                queries = self._queries if self.scorer.has_factors else {}
                 sessions: Sessions | None = None
                 for number, (rule, scorer) in enumerate(zip(rules, scorers, strict=True)):
                     key = first, rule.target, rule.minimum_target, widest.reach, weighted
@@ -114,6 +114,7 @@ class LoggedEvidence:
         view = view.select(np.sort(draw_episodes(view, most, [seed, 7])))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
+        self._above = torch.from_numpy(view.items_above(episodes, steps))
         self.propensities = read_propensities(view, episodes, steps)
         """(M,) if all steps have one."""
         self._users = np.unique(number_users(view), return_inverse=True)[1]
@@ -124,8 +125,9 @@ class LoggedEvidence:
         shape = len(rules), len(self._logged.steps)
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
         items = torch.from_numpy(self._logged.items).unsqueeze(1)
+        terms = [self._logged.scorer.under(rule).list_term for rule in rules]
         for part, n, scores in self._logged.score(rules):
-            chances = rules[n].log_probabilities(scores)
+            chances = rules[n].log_probabilities(scores, self._above[part], terms[n])
             logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
             top = best_items(scores, min(SHOWN, scores.shape[1]))
             hits[n, part] = (top == items[part]).any(1).numpy()

@@ -561,8 +561,7 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
             "to evaluate it"
         )
     if estimate.value + 2 * estimate.error < mean_return:
-        less = f"this is less than logged sessions have, {mean_return:.4g}"
-        warnings.append(f"{less}; do not launch it")
+        warnings.append(f"logged sessions have {mean_return:.4g}, which is more; do not launch it")
     return "".join(f"; WARNING: {warning}" for warning in warnings)
 
 

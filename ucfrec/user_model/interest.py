@@ -107,7 +107,6 @@ class UserRows:
         keys = users * (1 + len(times)) + numbers
         order = np.argsort(keys, kind="stable")
         order = order[(users[order] >= 0) & (items[order] >= 0)]
-
         if not len(order):
             return None
         targets = target(torch.from_numpy(rewards[order]))

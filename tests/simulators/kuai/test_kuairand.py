@@ -78,9 +78,7 @@ def test_equal_seeds_give_equal_files_and_nothing_is_left_of_a_failure(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.realdata
-def test_real_rows_make_a_good_environment(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_real_rows_make_an_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Evaluated on 29–30 April; what policies learn from, the days before, stays out."""
     source = data_folder("kuairand")
     log = pd.read_parquet(next(source.glob("log_*.parquet")))

@@ -42,9 +42,7 @@ def slowly(definition: ReturnToGo, rewards: list[float], step: int) -> float:
 
 
 @given(definitions, episodes_of_eighths)
-def test_every_definition_equals_brute_force(
-    definition: ReturnToGo, episodes: list[list[float]]
-) -> None:
+def test_definitions_equal_brute_force(definition: ReturnToGo, episodes: list[list[float]]) -> None:
     got = definition.of_logs(*flat(episodes))
     assert got.dtype == np.float32
     expected = [slowly(definition, e, t) for e in episodes for t in range(len(e))]

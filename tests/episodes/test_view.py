@@ -106,9 +106,7 @@ def test_views_see_their_episodes_only(tmp_path: Path, shard_steps: int) -> None
 
 @pytest.mark.parametrize("shard_steps", SHARDS)
 @pytest.mark.parametrize("items", [True, False])
-def test_a_view_leaves_out_some_of_what_was_observed(
-    tmp_path: Path, items: bool, shard_steps: int
-) -> None:
+def test_a_view_leaves_out_some_observations(tmp_path: Path, items: bool, shard_steps: int) -> None:
     episodes = random_episodes(LENGTHS, observation=3, items=items)
     store = write_store(tmp_path / "store", episodes, some_states() if items else None, shard_steps)
     view = store.select(np.array([6, 2, 4])).without_observation_dimensions([1])

@@ -144,9 +144,7 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
         ({"history": "3, much"}, "line 1 of the history"),
     ],
 )
-def test_what_is_wrong_is_said_on_the_page(
-    explorer: Explorer, given: dict[str, str], message: str
-) -> None:
+def test_a_page_says_what_is_wrong(explorer: Explorer, given: dict[str, str], message: str) -> None:
     assert message in got(explorer, "/", **given).text
 
 

@@ -131,9 +131,7 @@ def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, nam
     system.rm(folder, recursive=True)
 
 
-def test_a_file_that_changes_meanwhile_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_changes_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put(write_log(tmp_path / "log.parquet"), "memory://changing/log.parquet")
     system, _ = _open("memory://changing")
     found = system.find("/changing", detail=True)

@@ -421,9 +421,7 @@ def test_errors_of_frames_name_the_frame(frame: pd.DataFrame, said: str) -> None
     assert said in str(error.value)
 
 
-def test_a_scratch_folder_may_have_any_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scratch_folders_may_have_any_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("~y", "a?b", "c%2F[1]"):
         with engine([], Path(name)) as connection:

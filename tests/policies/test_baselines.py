@@ -57,9 +57,7 @@ def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])
-def test_the_half_life_is_short_where_tastes_change(
-    tmp_path: Path, kind: type[RecentRatePolicy]
-) -> None:
+def test_half_lives_are_short_in_drift(tmp_path: Path, kind: type[RecentRatePolicy]) -> None:
     for drifts in (False, True):
         (tmp_path / str(drifts)).mkdir()
         store = drifting_store(tmp_path / str(drifts), drifts)
@@ -107,9 +105,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 
 @pytest.mark.parametrize("name", ["gsasrec", "boosted"])
-def test_peers_beat_popularity_where_users_differ(
-    store: EpisodeStore, tmp_path: Path, name: str
-) -> None:
+def test_peers_win_where_users_differ(store: EpisodeStore, tmp_path: Path, name: str) -> None:
     run, out = str(tmp_path / name), tmp_path / "rows.json"
     settings = ["train.steps=300", "train.learning_rate=0.01", "train.validate_every=100"]
     settings += ["policy.dim=16", "policy.context=10", "rule.choose=false", "train.warmup_steps=0"]

@@ -81,7 +81,7 @@ def sessions_of(windows: Windows, users: tuple[int, ...] = (2, 0, -1)) -> Sessio
     actions, mask = windows.actions[:, :-1], windows.mask[:, :-1]
     actions = actions.masked_fill(~mask, -1) if actions.ndim == 2 else actions
     collected, known = torch.tensor([0.0, 1.0, 2.5]).double(), torch.tensor(users)
-    given = windows.rewards[:, :-1] * mask, windows.timesteps[:, -1], collected, known
+    given = windows.rewards[:, :-1] * mask, windows.timesteps[:, -1], collected, known, 0 * known
     return Sessions(actions, *given, states=windows.states)
 
 

@@ -87,6 +87,8 @@ def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame, at: int | No
             rows["steps"].append(len(items))
             rows["collected"].append(sum(rewards))
             rows["users"].append(user_of.get(user, -1))
+            trained_rows = latest.timestamps[own] <= (description["trained_until"] or 0)
+            rows["trained_steps"].append(trained_rows.sum() * (user in user_of))
             seen = [item_of[item] for item in batch.seen_ids[batch.seen_owner == number].tolist()]
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
@@ -127,10 +129,10 @@ def test_the_graph_recommends_what_the_policy_does(
     given = trained if tags else plain
     given = replace(given, session_end=boredom(given.reward_model.likeness))  # type: ignore[union-attr]
     given = replace(given, reward_model=copy.deepcopy(given.reward_model))
-    (learn_tastes if tags else learn_interests)(given)
+    log = histories()
+    (learn_tastes(given) if tags else learn_interests(given, int(log.timestamp.median())))
     # Several sessions and one are compared with torch in there.
     assert export(given, tmp_path / "out", rule=rule, k=20).difference <= 1e-5
-    log = histories()
     for some in (log, log[log.user_id == log.user_id.min()]):
         agree(tmp_path / "out", given, some, rule)
 

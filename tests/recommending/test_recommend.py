@@ -132,9 +132,7 @@ def test_scores_are_the_policys_at_the_next_step(
     np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=5e-4, atol=1e-5)
 
 
-def test_the_latest_session_makes_the_state_but_all_is_seen(
-    policy: Recommender, log: pd.DataFrame
-) -> None:
+def test_the_latest_session_makes_the_state(policy: Recommender, log: pd.DataFrame) -> None:
     user = log[log.user_id == 3]
     day = 86_400_000
     recent = user.tail(3)
@@ -437,7 +435,8 @@ def random_sessions(trained: TrainedPolicy, rule: DecisionRule, count: int = 40)
     items = torch.randint(24, (count, length), generator=generator)
     rewards = torch.randint(2, (count, length), generator=generator).float()
     steps, users = torch.full((count,), length), torch.arange(count) % 30 - 1
-    return Sessions(items, rewards, steps, rewards.sum(1, dtype=torch.float64), users)
+    collected = rewards.sum(1, dtype=torch.float64)
+    return Sessions(items, rewards, steps, collected, users, torch.zeros_like(steps))
 
 
 def some_left_out(sessions: Sessions) -> tuple[Tensor, Tensor]:

@@ -50,9 +50,7 @@ def slow(by: Responder, seconds: float) -> list[int]:
     return sizes
 
 
-def test_answers_are_those_of_the_command_and_share_passes(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
+def test_answers_are_the_commands_and_share_passes(trained: TrainedPolicy, tmp_path: Path) -> None:
     log = histories()
     log.to_parquet(tmp_path / "log.parquet")
     rule = "--exclude-seen --target 2 --minimum-target 0.1 --reward-weight 0.7 --tag-window 2"

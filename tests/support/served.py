@@ -63,9 +63,11 @@ def learn_tastes(trained: TrainedPolicy) -> None:
     tastes.weigh(torch.tensor(1.5))
 
 
-def learn_interests(trained: TrainedPolicy) -> None:
-    """Give the run's reward model interests of users, known and new."""
+def learn_interests(trained: TrainedPolicy, until: int = 0) -> None:
+    """Give the run's reward model interests of users, known and new, as if it had been trained on
+    rows until that time."""
     interests, random = trained.reward_model.interests, torch.Generator().manual_seed(3)
+    interests.until.fill_(until)
     for values in (interests.usual, interests.sums):
         values.copy_(torch.rand(values.shape, generator=random))
     interests.weigh(torch.randn(interests.weights.shape, generator=random))

@@ -74,9 +74,7 @@ def test_the_best_trial_is_the_run_that_is_kept(store: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_and_the_same_search_gives_the_same_trials(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_search_goes_on_and_gives_the_same_trials(store: Path, tmp_path: Path) -> None:
     first = values(tune(plan(store, tmp_path / "a"), 3))
     assert values(tune(plan(store, tmp_path / "a"), 3)) == first  # nothing is left to do
     more = values(tune(plan(store, tmp_path / "a"), 5))

@@ -8,7 +8,11 @@ import torch
 
 import ucfrec.user_model.interest as module
 from ucfrec import EpisodeStore
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, sessions_before
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
+from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.user_model.interest import UserRows
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
@@ -87,6 +91,32 @@ def test_what_is_fitted_is_what_is_served(binary: bool, tmp_path: Path) -> None:
     every = read.scores(rows.states, rows.history, rows.users)
     of_rows = every.gather(1, rows.items.unsqueeze(1)).squeeze(1)
     torch.testing.assert_close(of_rows, followed, atol=2e-5, rtol=1e-4)
+
+
+def test_rows_of_training_count_once_where_sessions_go_on(tmp_path: Path) -> None:
+    model, validation = fitted(True, tmp_path)
+    columns = {name: validation.whole.column(name) for name in ("item", "reward", "timestamp")}
+    users, steps = np.arange(USERS), np.arange(USERS) % (SESSIONS * STEPS)
+    episodes, states = {"split": 0 * users, "user": users}, validation.item_states
+    lengths = np.full(USERS, SESSIONS * STEPS)
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    sizes = {"state": store.state_size, "action": SIZE, "items": ITEMS, "users": USERS}
+    policy = DTPolicy(DTConfig(context=5, dim=8), sizes)
+    policy.head.start_from(states.embeddings, torch.ones(ITEMS))
+    rule = DecisionRule(0.0, reward_weight=1.0, policy_weight=0.0)
+    scorer = Scorer(policy.eval(), rule, states, ReturnToGo(), model)
+    later = steps >= (SESSIONS - 1) * STEPS
+    sessions = sessions_before(scorer, store, users[later], steps[later])
+    assert (sessions.trained_steps == (SESSIONS - 1) * STEPS).all()
+    found = scorer.scores(sessions)
+    times = torch.from_numpy(store.step_values("timestamp", users[later], steps[later]))
+    sums = model.sums_before(sessions.users, times)
+    before, shown = sessions.states[:, -1], sessions.shown
+    for item in range(ITEMS):
+        every = torch.full(times.shape, item)
+        score = model.score(before, shown, sessions.users, every, sums=sums)
+        found[:, item] -= score
+    torch.testing.assert_close(found, found[:, :1].expand_as(found), atol=1e-4, rtol=0)
 
 
 def test_a_click_raises_items_like_it_at_once(tmp_path: Path) -> None:

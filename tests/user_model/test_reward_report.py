@@ -143,9 +143,7 @@ def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     st.lists(st.sampled_from([0.01, 0.05, 0.2, 0.5, 1.0]), min_size=8, max_size=8),
     st.integers(2, 50),
 )
-def test_weights_add_up_to_a_users_effective_number_of_steps(
-    propensities: list[float], items: int
-) -> None:
+def test_weights_add_up_to_a_users_effective_steps(propensities: list[float], items: int) -> None:
     logged, zeros = np.array(propensities), np.zeros(8)
     columns = {"item": zeros.astype(np.int64), "reward": zeros, "propensity": logged}
     states = ItemStates(torch.ones(1, 2), torch.zeros(2, 0), 0.0, 1.0)

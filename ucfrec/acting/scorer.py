@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, ListTerm, best_items
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
@@ -22,7 +23,15 @@ from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows, pad_columns, seen_before
+from ucfrec.episodes.windows import (
+    Exposed,
+    Sessions,
+    Shown,
+    Windows,
+    list_earlier,
+    pad_columns,
+    seen_before,
+)
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
@@ -386,7 +395,7 @@ class Scorer:
         assert model is not None
         assert end is not None
         users, recent = query.sessions.users, query.sessions.shown
-        tastes = model.tastes_after(recent.latest(model.reach), users)
+        tastes = model.tastes_after(query.sessions.shown_since.latest(model.reach), users)
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span, steps = model.reward_high - model.reward_low, query.sessions.steps
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
@@ -516,7 +525,7 @@ class _ItemProduct:
         """The reward model's part, in states (B, S) before the steps to decide."""
         model, recent = self._model, sessions.shown
         assert model is not None
-        tastes = model.tastes_after(recent, sessions.users)
+        tastes = model.tastes_after(sessions.shown_since, sessions.users)
         query = model.query(states, sessions.users, tastes)
         _, repeated, alike = model.exposures(recent)
         factors = F.pad(query, (0, 1), value=1.0)
@@ -624,7 +633,14 @@ def sessions_before(
     steps: IntArray,
 ) -> Sessions:
     """What was known before steps (B,) of episodes (B,) of logs with the training's items."""
-    return Sessions.from_store(store, episodes, steps, scorer.policy.config.context, scorer.reach)
+    context, model = scorer.policy.config.context, scorer.reward_model
+    sessions = Sessions.from_store(store, episodes, steps, context, scorer.reach)
+    if model is None or not model.interests.are_known:
+        return sessions
+    owner, earlier = list_earlier(sessions.steps.numpy())
+    times = store.step_values(schema.TIMESTAMP, episodes[owner], earlier)
+    trained_steps = model.interests.count_trained(sessions.users, owner, times)
+    return replace(sessions, trained_steps=trained_steps)
 
 
 def logged_scores(

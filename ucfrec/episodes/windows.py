@@ -264,6 +264,8 @@ class Sessions(_Rows):
     """(B,) float64 sum of all rewards of the session."""
     users: Tensor
     """(B,) int64 numbers of the users in the training logs, −1 for others."""
+    trained_steps: Tensor
+    """(B,) int64 number of the session's first steps that the reward model knows of its user."""
     observations: Tensor | None = None
     """(B, K, O) float32 of the last K steps or more, the one to decide included; None without
     any."""
@@ -284,7 +286,7 @@ class Sessions(_Rows):
         if vector_size:
             actions = torch.zeros(count, length, vector_size)
         steps = torch.zeros(count, dtype=torch.int64)
-        return cls(actions, torch.zeros(count, length), steps, steps.double(), steps - 1)
+        return cls(actions, torch.zeros(count, length), steps, steps.double(), steps - 1, steps)
 
     @classmethod
     def from_rows(
@@ -313,6 +315,7 @@ class Sessions(_Rows):
             torch.from_numpy(counts),
             torch.from_numpy(collected),
             torch.from_numpy(users),
+            torch.from_numpy(0 * users),
             observations,
         )
 
@@ -344,6 +347,7 @@ class Sessions(_Rows):
             torch.from_numpy(starts),
             torch.from_numpy(store.rewards_before(episodes, starts)),
             torch.from_numpy(users),
+            torch.from_numpy(0 * users),
             states=store.windows(episodes, starts, context).states,
             offer=store.offer(episodes, steps),
         )
@@ -351,7 +355,7 @@ class Sessions(_Rows):
     def begin(self, rows: IntArray) -> None:
         """Let new sessions begin at the positions `rows`, of whichever users there are."""
         self.actions[rows] = -1
-        for values in (self.rewards, self.steps, self.collected):
+        for values in (self.rewards, self.steps, self.collected, self.trained_steps):
             values[rows] = 0
 
     def add_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
@@ -369,6 +373,13 @@ class Sessions(_Rows):
     def shown(self) -> Shown:
         """The items shown, the latest first."""
         return Shown(self.actions.flip(1), self.rewards.flip(1))
+
+    @property
+    def shown_since(self) -> Shown:
+        """Those that the reward model does not know of the user yet, −1 in place of others."""
+        items, rewards = self.shown
+        known = torch.arange(items.shape[1]) >= (self.steps - self.trained_steps).unsqueeze(1)
+        return Shown(items.masked_fill(known, -1), rewards)
 
     def latest_states(self, states: ItemStates, observations: Tensor) -> Tensor:
         """States (B, S) before the steps to decide, whose observations are (B, O)."""

@@ -32,7 +32,7 @@ OUTPUTS = ("scores", "top_items", "top_scores")
 TOLERANCE = 1e-5
 """Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
 """
-_STATE = ("items", "rewards", "steps", "collected", "users", "observations")
+_STATE = ("items", "rewards", "steps", "collected", "users", "trained_steps", "observations")
 """Inputs: the first fields of `Sessions`, of which `items` are the actions."""
 _TIMES, _EXCLUDED = "times", "excluded"
 _OPSET = 20
@@ -48,6 +48,7 @@ _MEANINGS = {
     "steps": "number of items that the session has shown",
     "collected": "sum of the rewards of the session",
     "users": "index of the user in user_ids; -1 for others",
+    "trained_steps": "number of the session's items, for known users, until trained_until, in ms",
     _TIMES: "time of the request in ms since 1970: items not available then are left out, and the "
     "reward model counts how old they are",
     _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "
@@ -254,6 +255,7 @@ def _draw_inputs(
         "steps": steps,
         "collected": rewards.sum(1, dtype=np.float64),
         "users": rng.integers(-1, max(1, len(states.user_features)), size=sessions),
+        "trained_steps": rng.integers(0, steps + 1),
     }
     if observed := scorer.policy.state_mean.shape[0] - states.size:
         size = (sessions, scorer.policy.config.context, observed)
@@ -424,6 +426,7 @@ def _describe_graph(
         "reward": record.reward,
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
+        "trained_until": None if (of := scorer.reward_model) is None else int(of.interests.until),
         "fingerprint": record.fingerprint,
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),

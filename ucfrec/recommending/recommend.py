@@ -337,8 +337,12 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
         context = trained.policy.config.context
         observations = torch.tensor(logged).unsqueeze(1).expand(-1, context, -1)
     users = trained.users.numbers(histories.users)
-    rows, rewards = histories.item_ids, histories.rewards
-    return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)
+    owner, items, rewards = histories.owner, histories.item_ids, histories.rewards
+    sessions = Sessions.from_rows(owner, items, rewards, users, length, observations)
+    if (model := trained.reward_model) is None:
+        return sessions
+    counts = model.interests.count_trained(sessions.users, owner, histories.timestamps)
+    return replace(sessions, trained_steps=counts)
 
 
 def uniforms(

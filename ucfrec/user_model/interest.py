@@ -34,7 +34,8 @@ class ShownTastes(nn.Module):
 
     def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
         super()._load_from_state_dict(*arguments, **options)
-        self.weigh(self.weights)
+        if not self.weights.is_meta:  # otherwise the file lacks them, which is said later
+            self.weigh(self.weights)
 
 
 class Interests(ShownTastes):
@@ -51,6 +52,19 @@ class Interests(ShownTastes):
         """What every item usually gets, as `ItemRewardModel.target`."""
         self.sums = nn.Buffer(torch.zeros(users, embedding_size + 2))
         """Sums of `sum_rows` of the training rows of every user."""
+        self.until = nn.Buffer(torch.tensor(torch.iinfo(torch.int64).min))
+        """Time, int64 ms, of the last of these rows."""
+
+    def count_trained(
+        self,
+        users: Tensor,
+        owner: IntArray,
+        times: IntArray,
+    ) -> Tensor:
+        """How many of N rows, at `times` (N,), of the sessions (N,) `owner` of users (B,), their
+        sums hold already, (B,) int64."""
+        known = (times <= int(self.until)) & (users.numpy()[owner] >= 0)
+        return torch.from_numpy(np.bincount(owner[known], minlength=len(users)))
 
     def sum_rows(
         self,
@@ -96,8 +110,9 @@ class UserRows:
         view: EpisodeStore,
         target: Callable[[Tensor], Tensor],
     ) -> "UserRows | None":
-        """The rows of a view, whose rewards `target` turns into what is predicted; None if it names
-        no users or times."""
+        """The rows of a view, but for very long sessions, whose rewards `target` turns into what is
+        predicted; None if it names no users or times."""
+        view = view.without_long_sessions()
         if not view.has_users or schema.TIMESTAMP not in view.record.columns:
             return None
         users = view.episode_values(schema.USER).astype(np.int64)[view.all_steps()[0]]

@@ -83,6 +83,8 @@ class UserModel:
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
             users[0].likeness = reward.likeness  # of the same items, in memory once
+        for model in (reward, *([users[0]] if users else [])):
+            model.rates = RunningRates.of(train, model.target)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             fatigue = None
@@ -100,6 +102,8 @@ class UserModel:
             if users is not None and report.new_users:
                 line = users[1].calibration
             else:
+                if users is None and reward.interests.are_known:
+                    reward.user_rows = UserRows.of(train.whole, reward.target)
                 line = calibrate(users[0] if users else reward, validation, _MOST_STEPS, seed)
             fitted: dict[str, Any] = {
                 "calibration": line,
@@ -107,10 +111,7 @@ class UserModel:
                 "fatigue": fatigue and asdict(fatigue),
             }
             save_tensors(path, dict(end.tensors), fitted)
-        for model in (reward, *([users[0]] if users else [])):
-            model.rates = RunningRates.of(train, model.target)
-        if reward.interests.are_known:
-            reward.user_rows = UserRows.of(train.whole, reward.target)
+        reward.user_rows = None  # only those of training and the session count from here on
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]

@@ -134,7 +134,7 @@ class ItemRewardModel(nn.Module):
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         """Of `state` size S, `action` size D, that of an item's embedding, and numbers of `items`,
-        of `users` whose effects it has, and of `tags` that one item has at most."""
+        of `users` whose effects it has, of those `followed`, and of `tags` of one item at most."""
         super().__init__()
         state, dim, items = sizes["state"], sizes["action"], sizes["items"]
         users = sizes.get("users", 0) + 1  # the last row is that of unknown users
@@ -162,7 +162,7 @@ class ItemRewardModel(nn.Module):
         self.above = nn.Buffer(torch.zeros(1))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
-        self.interests = Interests(users, items, dim)
+        self.interests = Interests(sizes.get("followed", users), items, dim)
         self.user_rows: UserRows | None = None
         """Of a store, until every decision; None for those of training and the session."""
 

@@ -193,7 +193,7 @@ class Design:
         return tags[self.tags].sum(1) + self.vectors @ content[self.n_tags :]
 
     def squares(self, name: str) -> Tensor:
-        """ShownTastes sum over rows of the squares of what each number of the effect multiplies."""
+        """Weighted sum over rows of the squares of what each number of the effect multiplies."""
         weight, sums = self.weights.unsqueeze(1), self.zeros(name)
         vectors = weight * self.rows.square()
         match name:
@@ -238,7 +238,7 @@ class Design:
         return float(self.squares(name).sum()) / self.count / spread**2
 
     def loss(self, predictor: Tensor) -> Tensor:
-        """ShownTastes log loss in nats, or half the squared error of standardised rewards, (M,)."""
+        """Weighted log loss in nats, or half the squared error of standardised rewards, (M,)."""
         if self.binary:
             return F.binary_cross_entropy_with_logits(
                 predictor, self.target, self.weights, reduction="none"

@@ -166,7 +166,7 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     set_statistics(model, rows, rows, store)
     design = Design.of(model, rows)
-    if not report.new_users:
+    if "interest" in report.kept:
         design = _follow_users(model, design, store, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
@@ -192,7 +192,8 @@ def fit_training_users(
 ) -> tuple[ItemRewardModel, TrainingUsersReport]:
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
-    model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
+    sizes = {**reward_model_sizes(train), "followed": 0}
+    model, file = ItemRewardModel(sizes), folder / _USERS_FITTED
     if file.exists():
         return model, _read_fit(file, model, TrainingUsersReport)
     sessions, states, weights = draw_sessions(train, seed), train.item_states, None
@@ -303,9 +304,11 @@ def _follow_users(
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))
     usual = effects["mean"] + effects["item"]
     model.interests.usual.copy_(torch.sigmoid(usual) if design.binary else usual)
-    users, end = torch.arange(len(model.user) - 1), int(logged.times[-1]) + 1
-    at_end = logged.sums_before(users, torch.full(users.shape, end), model.sum_rows)
+    users, until = torch.arange(len(model.user) - 1), int(logged.times[-1])
+    at_end = logged.sums_before(users, torch.full(users.shape, until + 1), model.sum_rows)
     model.interests.sums[:-1] = at_end
+    model.interests.until.fill_(until)
+    del logged  # the rows of a large store
     model.user_rows = UserRows.of(train.whole, model.target)
     return design.add_interests(model, model.sums_before(rows.users, rows.times))
 

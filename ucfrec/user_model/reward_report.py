@@ -195,8 +195,7 @@ class ItemRewardReport:
 
 def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     """Linear predictors (M,) of the items shown in `rows`."""
-    follows = model.interests.are_known and model.user_rows is not None
-    sums = model.sums_before(rows.users, rows.times) if follows else None
+    sums = None if model.user_rows is None else model.sums_before(rows.users, rows.times)
     scores = [
         model.score(
             rows.states[part],

@@ -64,6 +64,7 @@ def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeSt
             torch.from_numpy(steps),
             torch.from_numpy(store.rewards_before(episodes, steps)),
             torch.full((len(steps),), -1),
+            torch.zeros(len(steps), dtype=torch.int64),
             states=logged.states,
         )
         parts.append(scorer.act(sessions).numpy())

@@ -193,9 +193,7 @@ def test_a_run_goes_on_as_it_was_started_and_is_refitted_so(tmp_path: Path) -> N
     assert read_screening(whole) == read_screening(record)
 
 
-def test_runs_that_share_stages_are_screened_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shared_stages_are_screened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     screened_stores = []
 
     def screen(store: EpisodeStore, seed: int) -> ScreeningReport:
@@ -217,9 +215,7 @@ def test_runs_that_share_stages_are_screened_once(
     assert (record.dropped_observations, record.sizes["state"]) == ((), stores[0].state_size)
 
 
-def test_screening_that_leaves_no_state_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_screening_must_leave_some_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, "screen_store", screen_as(range(5)))
     store, config = planted_vectors(tmp_path / "store", 30, 8), resolve_config("bc", None, SETTINGS)
     with pytest.raises(InputError, match="no effect of any of the 5 state dimensions"):

@@ -165,9 +165,7 @@ def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_task_that_is_named_is_measured_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_named_task_is_measured_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
     budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
     assert planned(tmp_path, budget).missing() == ["sardine-static"]

@@ -51,7 +51,7 @@ _LARGEST_ERROR, _FAR_OFF = 0.08, 0.2
 normal errors of 8%, four in five are below 10%."""
 _FEWEST_STEPS = 50
 """Effective logged steps of half of the users that correct an estimate."""
-_RAREST = 5.0
+_RAREST = 3.0
 """Inverse propensities count at most as so many times the number of items."""
 _WIDEST = 0.4
 """Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""

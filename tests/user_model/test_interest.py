@@ -62,12 +62,13 @@ def test_sums_are_those_of_a_users_earlier_rows(
     for name in ("vectors", "interests.usual"):
         model.get_buffer(name).uniform_(0.1, 0.9)
     model.binary.fill_(binary)
-    rows = UserRows.of(view, lambda rewards: rewards)
+    users = torch.tensor([0, 3, 9, -1, 140, 5])
+    rows = UserRows.of(view, users, lambda rewards: rewards)
     assert rows is not None
     names = "item", "reward", "timestamp"
     items, rewards, times = (torch.from_numpy(view.column(name)) for name in names)
     of_row = torch.arange(40 * STEPS) // (SESSIONS * STEPS)
-    users, moments = torch.tensor([0, 3, 9, -1, 140, 5]), times[[0, 40, 3, 9, 50, -1]] + 1
+    moments = times[[0, 40, 3, 9, 50, -1]] + 1
     found = rows.sums_before(users, moments, model.sum_rows)
     for user, moment, sums in zip(users, moments, found, strict=True):
         some = (of_row == user) & (times < moment)

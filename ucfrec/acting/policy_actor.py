@@ -167,8 +167,7 @@ class PolicyActor:
         self._sessions = self._sessions.add_step(self._actions, torch.from_numpy(rewards))
 
     def _find_excluded(self) -> Tensor | None:
-        """(N, n_items) items that the environment lacks or forbids, or that were shown; None for
-        none."""
+        """(N, n_items) items that the environment lacks or forbids, or that were shown, if any."""
         n, n_items = len(self._sessions.steps), self._n_items
         parts = [] if self._absent is None else [self._absent.expand(n, n_items)]
         parts += [] if self._shown is None else [self._shown]

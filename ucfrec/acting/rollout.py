@@ -69,8 +69,7 @@ class Uniform(Memoryless):
         self._forbidden: IntArray | None = None
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Read the (N, L) forbidden items of each session from `info`, if the environment masks
-        items."""
+        """Read the (N, L) forbidden items of sessions from `info`, if the environment masks any."""
         self._forbidden = info.get(FORBIDDEN)
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:

@@ -1,5 +1,4 @@
-"""Tables of result rows: means and spreads over logs and seeds, and differences to a
-method."""
+"""Tables of result rows: means and spreads over logs and seeds, differences to a method."""
 
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -587,8 +587,7 @@ def _lookaheads(problem: Problem) -> list[float]:
 
 
 def _knows_lists(problem: Problem) -> bool:
-    """Whether decisions are lists, whose items are known to be worth less, or more, below others
-    like them."""
+    """Whether decisions are lists, whose items count less, or more, below others like them."""
     return problem.train.usual_list() > 1 and bool(problem.users.reward.above.any())
 
 

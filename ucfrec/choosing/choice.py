@@ -155,8 +155,7 @@ class RankedRule:
     hits: float
     """Share of liked validation rows whose item is among those shown."""
     gain: float
-    """Difference of `hits` from that of the most liked items, or of those liked lately if these are
-    better."""
+    """Difference of `hits` from the most liked items, or from those liked lately if better."""
     gain_error: float
     overlaps: bool
     """Whether it finds liked items better than these, and `rule.keep_hits` of the hits that it has

@@ -254,8 +254,7 @@ class Sessions(_Rows):
     """B sessions, each before the step to decide."""
 
     actions: Tensor
-    """(B, L) int64 items shown, the latest last, −1 before the session began; or (B, L, A) float32
-    vectors."""
+    """(B, L) int64 items shown, the latest last, −1 before the session; or (B, L, A) vectors."""
     rewards: Tensor
     """(B, L) float32 their rewards, in reward units; 0 before the session began."""
     steps: Tensor
@@ -267,8 +266,7 @@ class Sessions(_Rows):
     trained_steps: Tensor
     """(B,) int64 number of the session's first steps that the reward model knows of its user."""
     observations: Tensor | None = None
-    """(B, K, O) float32 of the last K steps or more, the one to decide included; None without
-    any."""
+    """(B, K, O) float32 of the last K steps or more, with the one to decide; None without any."""
     states: Tensor | None = None
     """(B, K, S) float32 of the last K steps or more, where they are known; None to build them."""
     offer: Offer | None = None

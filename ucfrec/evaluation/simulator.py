@@ -92,8 +92,7 @@ class Environment:
         behavior: str,
         seed: int,
     ) -> "tuple[VectorEnv[Any, Any, Any], Actor]":
-        """Parallel sessions and a built-in policy for them; InputError if there is none of that
-        name."""
+        """Parallel sessions and a built-in policy for them; InputError if none has that name."""
         simulator = self.simulator()
         if behavior not in simulator.behaviors:
             names = ", ".join(simulator.behaviors)

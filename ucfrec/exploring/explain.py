@@ -123,8 +123,7 @@ def _cut_history(user: Histories, time_ms: int) -> Histories:
 
 def read_pasted(text: str) -> pd.DataFrame:
     """The history that someone pasted: a row per line, `item_id` or `item_id, reward`, the latest
-    last, as a frame of one user whose rows are a minute apart. InputError if a reward is not a
-    number."""
+    last, as a frame of one user, a minute apart. InputError if a reward is not a number."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     parts = [line.rpartition(",") for line in lines]
     items = [item.strip() if comma else line for item, comma, line in parts]

@@ -91,8 +91,7 @@ def scratch_of(path: Path) -> Path:
 
 
 def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that files to write are none of those to read, and differ from each other; InputError
-    if not."""
+    """InputError unless files to write are none of those to read, and differ from each other."""
     taken = {path.resolve() for path in inputs}
     for path in written:
         if path.resolve() in taken:

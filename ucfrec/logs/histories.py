@@ -182,8 +182,7 @@ def frame_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[Histories]:
-    """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
-    too."""
+    """`read_histories` of a log in memory, without the disk; InputError as of `log_table`, too."""
     columns = log_table(frame, HISTORIES, mapping, reward)
     with engine((), None) as connection:
         connection.register(HISTORIES, columns)

@@ -93,8 +93,7 @@ class LoggedSteps:
     densities: bool = False
     """Whether `propensity` and `target` are densities of vector actions, which may exceed 1."""
     place: IntArray | None = None
-    """(N,) position of each step in the list of its decision, from 0; None where every step is a
-    decision."""
+    """(N,) position of each step in its decision's list, from 0; None where each is a decision."""
     positions: Positions = "cascade"
     """How the positions of a list influence each other."""
 

@@ -337,8 +337,7 @@ def seen_too_often(seen: float | None) -> list[str]:
 
 
 def _hash_rows(store: EpisodeStore) -> Iterator[Array]:
-    """(N,) hash of each step's numbers of user and item, and its time (ms); some steps at a time,
-    in order."""
+    """(N,) hash of each step's user, item and time (ms), some steps at a time, in order."""
     users: Array = store.episode_values(schema.USER)
     for episodes, steps in store.step_batches() if store.n_episodes else ():
         names = (schema.ITEM, schema.TIMESTAMP)

@@ -190,8 +190,7 @@ class Parent:
         self._thread.start()
 
     def ends(self, server: uvicorn.Server) -> None:
-        """From now on the parent ends a server; before, it ends the process, which serves no one
-        yet."""
+        """From now on the parent ends a server; before, a process that serves no one yet."""
         with self._lock:
             self._server = server
 

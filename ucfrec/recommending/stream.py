@@ -51,8 +51,7 @@ def answer_stream(
 
 
 class _Answers:
-    """Answers lines, and remembers the rows of the users who were heard of last; user 7 is user
-    "7"."""
+    """Answers lines, and remembers the rows of users who were heard of last; user 7 is user "7"."""
 
     def __init__(
         self,

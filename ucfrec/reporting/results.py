@@ -133,8 +133,7 @@ def _conclude_rows(place: str, rows: Sequence[ResultRow]) -> Finding:
 
 
 def _read_object(name: str, values: Mapping[str, Any]) -> Finding:
-    """What a JSON object of `ucfrec compare`, of the record of an updated run or of another command
-    says."""
+    """What a JSON object of `ucfrec compare`, of an updated run or of another command says."""
     if "always" in values:
         return _conclude_comparison(TypeAdapter(Comparison).validate_python(values))
     if update := values.get("update"):

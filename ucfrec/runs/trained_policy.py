@@ -58,8 +58,7 @@ class TrainedPolicy:
     of steps if a target is set again at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
     reward_model: ItemRewardModel | None = None
-    """Of the rewards of items, for decision rules with a reward weight; None if the run fitted
-    none."""
+    """Of the rewards of items, for rules with a reward weight; None if the run fitted none."""
     counts: TrainingCounts | None = None
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
     session_end: SessionEnd | None = None

@@ -55,6 +55,25 @@ class Interests(ShownTastes):
         self.until = nn.Buffer(torch.tensor(torch.iinfo(torch.int64).min))
         """Time, int64 ms, of the last of these rows."""
 
+    def add_rows(
+        self,
+        view: EpisodeStore,
+        target: Callable[[Tensor], Tensor],
+        sum_rows: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        """Add all rows of a view, whose rewards `target` turns into what is predicted."""
+        users = torch.from_numpy(view.episode_values(schema.USER)).long()
+        for episodes, steps in view.step_batches():
+            items, rewards, times = (
+                torch.from_numpy(view.step_values(name, episodes, steps))
+                for name in (schema.ITEM, schema.REWARD, schema.TIMESTAMP)
+            )
+            rows = sum_rows(items.long().unsqueeze(1), target(rewards).unsqueeze(1))
+            # Unknown users, −1, are the last row.
+            self.sums.index_add_(0, users[episodes] % len(self.sums), rows)
+            self.until.clamp_(min=times.max())
+        self.sums[-1] = 0.0
+
     def count_trained(
         self,
         users: Tensor,
@@ -94,7 +113,7 @@ class Interests(ShownTastes):
 
 @dataclass(frozen=True)
 class UserRows:
-    """The rows of a view of a store of items, by user and time."""
+    """The rows of users of a store of items, by user and time."""
 
     keys: IntArray
     """(N,) ascending: the user's number times (1 + T), plus the number of the time."""
@@ -108,20 +127,24 @@ class UserRows:
     def of(
         cls,
         view: EpisodeStore,
+        users: Tensor,
         target: Callable[[Tensor], Tensor],
     ) -> "UserRows | None":
-        """The rows of a view, but for very long sessions, whose rewards `target` turns into what is
-        predicted; None if it names no users or times."""
-        view = view.without_long_sessions()
+        """The rows of a view that were shown to `users`, but for very long sessions; `target` turns
+        their rewards into what is predicted. None if the view names no users or times."""
         if not view.has_users or schema.TIMESTAMP not in view.record.columns:
             return None
-        users = view.episode_values(schema.USER).astype(np.int64)[view.all_steps()[0]]
+        view = view.without_long_sessions()
+        owners = view.episode_values(schema.USER).astype(np.int64)
+        followed = np.flatnonzero(np.isin(owners, users[users >= 0].numpy()))
+        view = view.select(followed)
+        owners = owners[followed][view.all_steps()[0]]
         names = schema.TIMESTAMP, schema.ITEM, schema.REWARD
         logged, items, rewards = (view.column(name) for name in names)
         times, numbers = np.unique(logged, return_inverse=True)
-        keys = users * (1 + len(times)) + numbers
+        keys = owners * (1 + len(times)) + numbers
         order = np.argsort(keys, kind="stable")
-        order = order[(users[order] >= 0) & (items[order] >= 0)]
+        order = order[items[order] >= 0]
         if not len(order):
             return None
         targets = target(torch.from_numpy(rewards[order]))

@@ -83,7 +83,7 @@ class UserModel:
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
             users[0].likeness = reward.likeness  # of the same items, in memory once
-        for model in (reward, *([users[0]] if users else [])):
+        for model in filter(None, (reward, users and users[0])):
             model.rates = RunningRates.of(train, model.target)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
@@ -103,7 +103,8 @@ class UserModel:
                 line = users[1].calibration
             else:
                 if users is None and reward.interests.are_known:
-                    reward.user_rows = UserRows.of(train.whole, reward.target)
+                    shown_to = torch.from_numpy(validation.episode_values(schema.USER))
+                    reward.user_rows = UserRows.of(train.whole, shown_to, reward.target)
                 line = calibrate(users[0] if users else reward, validation, _MOST_STEPS, seed)
             fitted: dict[str, Any] = {
                 "calibration": line,

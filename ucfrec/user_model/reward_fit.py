@@ -115,7 +115,7 @@ def fit_item_reward_model(
     set_statistics(model, rows, held_out, train)
     design, new_users = Design.of(model, rows), _are_new(rows, held_out)
     if not new_users:
-        design = _follow_users(model, design, train, rows)
+        design = _follow_users(model, design, train, rows, held_out)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
     if new_users:
@@ -167,7 +167,7 @@ def refit_item_reward_model(
     set_statistics(model, rows, rows, store)
     design = Design.of(model, rows)
     if "interest" in report.kept:
-        design = _follow_users(model, design, store, rows)
+        design = _follow_users(model, design, store, rows, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     if report.new_users:
@@ -295,21 +295,18 @@ def _follow_users(
     design: Design,
     train: EpisodeStore,
     rows: RewardRows,
+    held_out: RewardRows,
 ) -> Design:
     """The design of `rows` with the interests of users, if these are named; sets what items usually
     get, and what users were shown at every time and at the end of training."""
-    logged = UserRows.of(train, model.target)
-    if logged is None:
+    users = torch.cat([rows.users, held_out.users])
+    model.user_rows = UserRows.of(train.whole, users, model.target)
+    if model.user_rows is None:
         return design
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))
     usual = effects["mean"] + effects["item"]
     model.interests.usual.copy_(torch.sigmoid(usual) if design.binary else usual)
-    users, until = torch.arange(len(model.user) - 1), int(logged.times[-1])
-    at_end = logged.sums_before(users, torch.full(users.shape, until + 1), model.sum_rows)
-    model.interests.sums[:-1] = at_end
-    model.interests.until.fill_(until)
-    del logged  # the rows of a large store
-    model.user_rows = UserRows.of(train.whole, model.target)
+    model.interests.add_rows(train, model.target, model.sum_rows)
     return design.add_interests(model, model.sums_before(rows.users, rows.times))
 
 

@@ -156,14 +156,14 @@ def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> No
     assert search.level([low, high]) == [low, high]
     # Of these, the simplest: the higher temperature, whatever comes first.
     assert search.best([low, high]) == search.best([high, low]) == high
-    # Or the one that the log says most of: the likelihood, then the hits.
-    likely = replace(low, evidence=RuleEvidence(0.1, 0.2))
-    unlikely, hitting = (replace(high, evidence=RuleEvidence(0.3, each)) for each in (0.1, 0.2))
-    assert search.most_evident([unlikely, likely]) == likely
-    assert search.most_evident([likely, hitting]) == hitting
+    # Or the one that the log says most of: by effective users, then the hits.
+    known = replace(low, evidence=RuleEvidence(0.1, 20.0))
+    unknown, hitting = (replace(high, evidence=RuleEvidence(0.3, n)) for n in (9.0, 20.0))
+    assert search.most_evident([unknown, known]) == known
+    assert search.most_evident([known, hitting]) == hitting
     # Or what it says of their values, less their errors, if it can evaluate both.
     low, high = (
-        replace(rule, evidence=RuleEvidence(0.1, 0.1, users, 0.0, value, 0.2))
+        replace(rule, evidence=RuleEvidence(0.1, users, 0.0, value, 0.2))
         for rule, users, value in ((low, 300.0, 1.5), (high, 900.0, 1.4))
     )
     assert search.most_evident([low, high]) == high

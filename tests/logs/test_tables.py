@@ -171,9 +171,7 @@ def test_users_of_text_and_of_integers_are_the_same(tmp_path: Path, text: str) -
 
 
 @pytest.mark.parametrize("parts", [["7,8", "7.0"], ["7,7.0,8"]])
-def test_ids_with_and_without_decimals_are_noted_and_can_be_made_one(
-    tmp_path: Path, parts: list[str]
-) -> None:
+def test_ids_with_decimals_are_noted_and_can_be_made_one(tmp_path: Path, parts: list[str]) -> None:
     times = itertools.count(START)
     for n, users in enumerate(parts):
         lines = [f"{user},{user[0]},{next(times)},{user[0]}" for user in users.split(",")]

@@ -90,9 +90,7 @@ def test_a_folder_that_cannot_be_written_loses_nothing_once_it_can(
         log.close()
 
 
-def test_recommend_writes_the_exposures_of_its_recommendations(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
+def test_recommend_writes_its_exposures(trained: TrainedPolicy, tmp_path: Path) -> None:
     histories().to_parquet(tmp_path / "log.parquet")
     out, shown = tmp_path / "out.parquet", tmp_path / "shown.parquet"
     arguments = ["recommend", str(trained.folder), str(tmp_path / "log.parquet"), "--k", "4"]

@@ -11,7 +11,7 @@ import torch
 from tests.support.killed import kills
 from tests.support.later import NEW, later_log, later_mapping
 from tests.support.served import SETTINGS, trained_run
-from tests.support.tagged import ITEMS, tagged_log
+from tests.support.tagged import ITEMS, tagged_log, tagged_store
 from tests.support.tensors import assert_same_tensors
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
@@ -67,9 +67,18 @@ def test_an_update_of_an_update_has_the_settings_of_the_first_run(folder: Path) 
     second = RunRecord.read(folder / "run2")
     assert third.update.settings_from_nothing == second.update.settings_from_nothing
     assert replace(third.config, rule=second.config.rule) == second.config
-    # The second run draws its items, and so does its update.
-    assert min(second.config.rule.temperatures) == 0 < second.rule.rule.temperature
-    assert min(third.config.rule.temperatures) > 0 < third.rule.rule.temperature
+
+
+def test_the_update_of_a_rule_that_draws_draws(tmp_path: Path) -> None:
+    more = ["rule.evidence=5", "rule.least_items=2.0", "rule.temperatures=[0.0,4.0]"]
+    store = tagged_store(tmp_path, propensity=1 / ITEMS)
+    Recommender("dt", settings=[*SETTINGS, *more]).fit(store, tmp_path / "run")
+    later_log(propensity=True).to_parquet(tmp_path / "later.parquet")
+    logs, mapping = [tmp_path / "later.parquet"], later_mapping(tmp_path)
+    update_run(tmp_path / "run", logs, tmp_path / "run2", mapping=mapping)
+    first, second = (RunRecord.read(tmp_path / name) for name in ("run", "run2"))
+    assert min(first.config.rule.temperatures) == 0 < first.rule.rule.temperature
+    assert min(second.config.rule.temperatures) > 0 < second.rule.rule.temperature
 
 
 def test_the_same_command_goes_on_and_another_is_refused(

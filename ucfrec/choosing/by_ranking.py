@@ -127,8 +127,9 @@ class LoggedEvidence:
         items = torch.from_numpy(self._logged.items).unsqueeze(1)
         terms = [self._logged.scorer.under(rule).list_term for rule in rules]
         for part, n, scores in self._logged.score(rules):
-            chances = rules[n].log_probabilities(scores, self._above[part], terms[n])
-            logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
+            if self.propensities is not None:
+                chances = rules[n].log_probabilities(scores, self._above[part], terms[n])
+                logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
             top = best_items(scores, min(SHOWN, scores.shape[1]))
             hits[n, part] = (top == items[part]).any(1).numpy()
         return [self._weigh(logs[n], hits[n]) for n in range(len(rules))]
@@ -136,21 +137,20 @@ class LoggedEvidence:
     def _weigh(self, logs: Float64Array, hits: BoolArray) -> RuleEvidence:
         liked, view = self._logged.liked, self._logged.view
         rate = float(hits[liked].mean()) if liked.any() else 0.0
-        likelihood = float(np.exp(logs.mean()))
         if self.propensities is None:
-            return RuleEvidence(rate, likelihood)
+            return RuleEvidence(rate)
         sums = np.bincount(self._logged.episodes, logs - np.log(self.propensities))
         weights = np.exp(np.minimum(sums, 100.0))
         above = np.bincount(self._users, weights * view.returns).astype(np.float64)
         below = np.bincount(self._users, weights).astype(np.float64)
         if not below.any():
-            return RuleEvidence(rate, likelihood, 0.0)
+            return RuleEvidence(rate, 0.0)
         halves = [half for half in (below[::2], below[1::2]) if len(half)]
         effective_users = 2 * min(effective_number(half) for half in halves)
         spread = float(sums[np.isfinite(sums)].var())
         value = above.sum() / below.sum()
         error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return RuleEvidence(rate, likelihood, effective_users, spread, value, error)
+        return RuleEvidence(rate, effective_users, spread, value, error)
 
 
 class LoggedOutcomes(NamedTuple):

@@ -36,7 +36,7 @@ from ucfrec.user_model.reward_report import number_users, read_propensities
 _LOGGED_STEPS = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
 _FINALISTS = 8
-"""Rules that are simulated again where users differ in their tastes, …"""
+"""Rules that are simulated again, …"""
 _TIMES = 4
 """… in so many times the sessions, as a half of an estimate: few show users more than rules."""
 _FEWEST = 10
@@ -378,7 +378,7 @@ class RuleSearch:
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """Of level rules, the one that the choice starts from, or the one that the log prefers: by
         value less its error, if the log can evaluate it; else by effective users, if more than a
-        handful, else by likelihood; then by hits, in whole percents; then the simplest."""
+        handful; then by hits, in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
         unknown = [candidate for candidate in level if not candidate.evidence]
@@ -387,7 +387,7 @@ class RuleSearch:
         def rank(candidate: SimulatedRule) -> tuple[float, ...]:
             evidence, users = candidate.evidence, candidate.effective_users
             assert evidence is not None
-            support = users if users >= _FEWEST else evidence.likelihood
+            support = users if users >= _FEWEST else 0.0
             if self.least_users and self.is_allowed(candidate):
                 support = (evidence.value or 0.0) - (evidence.error or 0.0)
             return (-support, -round(evidence.hits, 2), *_simplicity(candidate))
@@ -479,8 +479,8 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     """Choose target, minimum target and temperature, then the reward weight, and what
     `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
 
-    For new users and lists, rules of the highest value are then simulated in more sessions. Of
-    rules that the model cannot distinguish, the log decides.
+    Rules of the highest value are then simulated in more sessions. Of rules that the model cannot
+    distinguish, the log decides.
     """
     search, where = RuleSearch(problem), ""
     if (start := problem.start) is None:
@@ -489,10 +489,8 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         where = "; only rules near that of an earlier run"
         more = _NEAR_THE_LOG if search.least_users else ()
         candidates = search.simulate([*dict.fromkeys(find_neighbours(start, problem, more))])
-    finalists = candidates
-    if search.users.reward_report.new_users or search.list_size > 1:
-        finalists = search.finalists(candidates, search.best(candidates))
-        candidates = [*{item.rule: item for item in [*candidates, *finalists]}.values()]
+    finalists = search.finalists(candidates, search.best(candidates))
+    candidates = [*{item.rule: item for item in [*candidates, *finalists]}.values()]
     best = search.most_evident(finalists)
     estimate = search.estimate(best.rule)
     chosen = RuleRecord(
@@ -634,7 +632,7 @@ def find_neighbours(
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     rule = candidate.rule
     return (
-        *(rule.by_marginal_gain, rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0),
+        *(rule.by_marginal_gain, rule.lookahead > 0, rule.tag_run > 0, rule.tag_window > 0),
         -rule.temperature,
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )

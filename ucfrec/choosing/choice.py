@@ -97,8 +97,6 @@ class RuleEvidence:
 
     hits: float
     """Share of liked steps whose item is among the ten best."""
-    likelihood: float
-    """Geometric mean of the probabilities with which the rule shows what was logged."""
     effective_users: float | None = None
     """Effective sample size in users under importance weights: twice that of the half of the log
     with the smaller one; None without propensities."""

@@ -275,13 +275,12 @@ def test_rules_of_the_highest_value_are_simulated_in_more_sessions(trained: Trai
     search, more = (search_of(trained, replace(FEW, sessions=sessions)) for sessions in (10, 40))
     simulated = search.simulate([drawn(weight) for weight in (0, 0.5, 1, 2, 3, 4, 5, 6, 7, 8)])
     allowed = [each for each in simulated if search.is_allowed(each)]
-    worst = min(allowed, key=lambda each: each.value)
-    again = search.finalists(simulated, worst)
-    assert again[0].rule == worst.rule
+    best, again = search.best(simulated), search.finalists(simulated)
+    assert again[0].rule == best.rule
     assert len(again) == min(8, len(allowed))
-    highest = sorted((each.value for each in allowed), reverse=True)[: len(again) - 1]
-    found = {each.rule for each in again[1:]}
-    assert all(each.rule in found for each in allowed if each.value > highest[-1] and each != worst)
+    others, found = [each for each in allowed if each != best], {each.rule for each in again[1:]}
+    least = sorted((each.value for each in others), reverse=True)[len(found) - 1]
+    assert all(each.rule in found for each in others if each.value > least)
     assert again[1] == more.simulate([again[1].rule])[0]
 
 

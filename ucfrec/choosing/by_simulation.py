@@ -341,11 +341,12 @@ class RuleSearch:
         return allowed or [*filter(self.is_supported, candidates)]
 
     def finalists(
-        self, candidates: Sequence[SimulatedRule], best: SimulatedRule
+        self,
+        candidates: Sequence[SimulatedRule],
     ) -> list[SimulatedRule]:
         """The best, the start, and allowed ones of the highest value, in more sessions."""
         allowed = sorted(filter(self.is_allowed, candidates), key=_value, reverse=True)
-        ranked = (best, *self._find_start(candidates), *allowed)
+        ranked = (self.best(candidates), *self._find_start(candidates), *allowed)
         rules = dict.fromkeys(candidate.rule for candidate in ranked)
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
@@ -489,7 +490,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         where = "; only rules near that of an earlier run"
         more = _NEAR_THE_LOG if search.least_users else ()
         candidates = search.simulate([*dict.fromkeys(find_neighbours(start, problem, more))])
-    finalists = search.finalists(candidates, search.best(candidates))
+    finalists = search.finalists(candidates)
     candidates = [*{item.rule: item for item in [*candidates, *finalists]}.values()]
     best = search.most_evident(finalists)
     estimate = search.estimate(best.rule)

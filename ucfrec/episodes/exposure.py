@@ -78,7 +78,7 @@ class Likeness(nn.Module):
         return self._n_tags
 
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:
-        """The sum (M, F), weighted (M, N), of tags or directions of items (M, N), −1 for none."""
+        """The sum (M, F), by weights (M, N), of tags or directions of items, −1 for none."""
         weights = weights.masked_fill(items < 0, 0.0)
         if not self.tags.shape[1]:
             profile = torch.einsum("mn,mnf->mf", weights, self.directions[items])

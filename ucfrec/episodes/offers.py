@@ -127,7 +127,7 @@ class Offer:
         return offered
 
     def mask(self, items: Tensor | None = None) -> Tensor:
-        """(M, L) bool, whether `items` (L,) int64, ascending, each once, were on offer; or all."""
+        """(M, L) bool, whether `items` (L,) int64, ascending, were on offer; None for all items."""
         offers, times = self.offers, self.times.unsqueeze(1)
         begin, end = offers.begin, offers.end
         if items is not None:

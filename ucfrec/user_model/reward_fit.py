@@ -306,7 +306,7 @@ def _follow_users(
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))
     usual = effects["mean"] + effects["item"]
     model.interests.usual.copy_(torch.sigmoid(usual) if design.binary else usual)
-    model.interests.add_rows(train, model.target, model.sum_rows)
+    model.interests.add_rows(train.without_long_sessions(), model.target, model.sum_rows)
     return design.add_interests(model, model.sums_before(rows.users, rows.times))
 
 

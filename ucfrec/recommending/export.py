@@ -48,7 +48,7 @@ _MEANINGS = {
     "steps": "number of items that the session has shown",
     "collected": "sum of the rewards of the session",
     "users": "index of the user in user_ids; -1 for others",
-    "trained_steps": "number of the session's items, for known users, until trained_until, in ms",
+    "trained_steps": "number of the session's items until trained_until (ms); 0 for unknown users",
     _TIMES: "time of the request in ms since 1970: items not available then are left out, and the "
     "reward model counts how old they are",
     _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "

@@ -52,8 +52,8 @@ class Interests(ShownTastes):
         """What every item usually gets, as `ItemRewardModel.target`."""
         self.sums = nn.Buffer(torch.zeros(users, embedding_size + 2))
         """Sums of `sum_rows` of the training rows of every user."""
-        self.until = nn.Buffer(torch.tensor(torch.iinfo(torch.int64).min))
-        """Time, int64 ms, of the last of these rows."""
+        self.until = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        """Time, ms, of the last of these rows; 0 without any."""
 
     def add_rows(
         self,
@@ -80,8 +80,8 @@ class Interests(ShownTastes):
         owner: IntArray,
         times: IntArray,
     ) -> Tensor:
-        """How many of N rows, at `times` (N,), of the sessions (N,) `owner` of users (B,), their
-        sums hold already, (B,) int64."""
+        """How many of N rows, at `times` (N,), of the sessions (N,) `owner` of users (B,), are no
+        later than training, whose rows the sums of known users hold: (B,) int64."""
         known = (times <= int(self.until)) & (users.numpy()[owner] >= 0)
         return torch.from_numpy(np.bincount(owner[known], minlength=len(users)))
 

@@ -166,7 +166,7 @@ def test_action_copies_are_their_source_up_to_their_own_last_step(
 
 
 @pytest.mark.parametrize("items", [True, False])
-def test_steps_are_drawn_uniformly_of_an_action_copy_the_last(tmp_path: Path, items: bool) -> None:
+def test_steps_are_uniform_and_of_action_copies_the_last(tmp_path: Path, items: bool) -> None:
     store = make_store(tmp_path, items).select(np.array([0, 2, 3, 5]))
     augmented = random_edits(store, 2, seed=1)[0].join(random_action_copies(store, 5, seed=2))
     training = TrainingEpisodes(store, augmented)

@@ -177,7 +177,7 @@ def test_the_command_writes_a_log_that_prepare_reads(
     assert "mean 0.25" in capsys.readouterr().out
 
 
-def test_exposures_are_no_feedback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exposures_are_not_feedback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shown = exposures(tmp_path / "shown")
     (tmp_path / "clicks.csv").write_text(csv("click", "1"))
     expanded = [str(path) for path in sorted(shown.glob("*.parquet"))]

@@ -102,7 +102,7 @@ USERS = pd.DataFrame(
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-def test_parts_of_features_are_joined_by_names_of_columns(tmp_path: Path, suffix: str) -> None:
+def test_parts_of_features_are_joined_by_column_names(tmp_path: Path, suffix: str) -> None:
     write(random_log(), tmp_path / "log.parquet")
     reports = []
     for n, columns in enumerate((list(USERS.columns), ["AGE", "User_ID", "spend"])):

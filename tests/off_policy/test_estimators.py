@@ -56,7 +56,7 @@ def by_hand(steps: LoggedSteps) -> dict[str, float]:
 
 
 def normalised_by_hand(steps: LoggedSteps) -> dict[str, float]:
-    """ShownTastes PDIS and weighted DR, every session going on without reward once it has ended."""
+    """Weighted PDIS and weighted DR, every session going on without reward once it has ended."""
     sessions = rows_of(steps)
     weights = [1.0] * len(sessions)
     found = {"SNPDIS": 0.0, "SNDR": 0.0}

@@ -57,7 +57,7 @@ def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])
-def test_half_lives_are_short_in_drift(tmp_path: Path, kind: type[RecentRatePolicy]) -> None:
+def test_drift_shortens_half_lives(tmp_path: Path, kind: type[RecentRatePolicy]) -> None:
     for drifts in (False, True):
         (tmp_path / str(drifts)).mkdir()
         store = drifting_store(tmp_path / str(drifts), drifts)

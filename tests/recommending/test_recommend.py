@@ -132,7 +132,7 @@ def test_scores_are_the_policys_at_the_next_step(
     np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=5e-4, atol=1e-5)
 
 
-def test_the_latest_session_makes_the_state(policy: Recommender, log: pd.DataFrame) -> None:
+def test_sessions_make_the_state_but_all_is_seen(policy: Recommender, log: pd.DataFrame) -> None:
     user = log[log.user_id == 3]
     day = 86_400_000
     recent = user.tail(3)

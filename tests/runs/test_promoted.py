@@ -41,7 +41,7 @@ def current(folder: Path) -> str | None:
     return getattr(promoted(folder), "current", None)
 
 
-def test_a_first_run_needs_no_verdict_later_ones_do(trained: TrainedPolicy, tmp_path: Path) -> None:
+def test_only_later_runs_need_a_verdict(trained: TrainedPolicy, tmp_path: Path) -> None:
     folder = runs(trained, tmp_path, "a", "b", "c")
     promote(folder / "a")
     with pytest.raises(InputError, match="no verdict"):

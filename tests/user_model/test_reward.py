@@ -166,7 +166,7 @@ def test_nothing_shown_or_nothing_unusual_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 4, 33])
-def test_elimination_solves_as_factorisation(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elimination_equals_factorisation(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     random = torch.Generator().manual_seed(size)
     inputs = 5 * torch.randn(6, 50, size, generator=random)
     matrix, right = inputs.mT @ inputs + torch.eye(size), torch.randn(6, size, 1, generator=random)

@@ -264,7 +264,7 @@ class Sessions(_Rows):
     users: Tensor
     """(B,) int64 numbers of the users in the training logs, −1 for others."""
     trained_steps: Tensor
-    """(B,) int64 number of the session's first steps that the reward model knows of its user."""
+    """(B,) int64 number of the session's first steps that are training rows of the reward model."""
     observations: Tensor | None = None
     """(B, K, O) float32 of the last K steps or more, with the one to decide; None without any."""
     states: Tensor | None = None
@@ -374,7 +374,7 @@ class Sessions(_Rows):
 
     @property
     def shown_since(self) -> Shown:
-        """Those that the reward model does not know of the user yet, −1 in place of others."""
+        """The same, with −1 in place of the items of `trained_steps`."""
         items, rewards = self.shown
         known = torch.arange(items.shape[1]) >= (self.steps - self.trained_steps).unsqueeze(1)
         return Shown(items.masked_fill(known, -1), rewards)

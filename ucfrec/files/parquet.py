@@ -63,7 +63,7 @@ def read_ids(path: Path, column: str) -> Array:
 
 
 def require_table_names(paths: Iterable[Path | None]) -> None:
-    """Check that tables to write end in .parquet, .csv, or nothing, for Parquet, or InputError."""
+    """InputError unless tables to write end in .parquet, .csv, or nothing, for Parquet."""
     for path in paths:
         if path is not None and path.suffix.lower() not in ("", ".parquet", ".csv"):
             raise InputError(

@@ -26,7 +26,7 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write named tensors and metadata of JSON, atomically; InputError if there is no space."""
+    """Write named tensors and JSON metadata, atomically; InputError if there is no space."""
     plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
     save_arrays(path, {name: tensor.numpy() for name, tensor in plain.items()}, metadata)
 

@@ -219,7 +219,7 @@ class ItemHead(nn.Module):
         actions: Tensor,
         exposed: Exposed | None = None,
     ) -> Tensor:
-        """The negative log-likelihood (M,), nats, of steps of features (M, d) and actions (M,)."""
+        """The negative log-likelihood (M,), nats, of steps: features (M, d), actions (M,)."""
         if not self.samples:
             logits = self._predict_with(actions, features, exposed)
             return F.cross_entropy(logits, actions, reduction="none")

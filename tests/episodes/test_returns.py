@@ -71,11 +71,8 @@ def test_only_a_target_of_a_session_is_lowered_by_rewards() -> None:
 def test_the_past_of_a_window_is_as_in_training(
     definition: ReturnToGo, rewards: list[float], length: int
 ) -> None:
-    """If the future brings the target, acting sees what training would have shown.
-
-    Of a horizon, what is asked for is taken to come evenly: the rewards from the last step on are
-    equal here.
-    """
+    """If the future brings the target, acting sees what training would have shown. A horizon's is
+    taken to come evenly: the rewards from the last step on are equal here."""
     last = len(rewards) - 1
     if definition.definition == "horizon":
         rewards = rewards[:-1] + [rewards[-1]] * definition.horizon

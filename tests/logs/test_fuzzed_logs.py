@@ -106,9 +106,7 @@ def write(part: Part, folder: Path, number: int) -> Path:
 
 def rows_of(files: Sequence[tuple[Path, str]]) -> Rows:
     """The rows that a log has, of rows with one user, item and time that with the highest reward.
-
-    Each file is Parquet or CSV, with the format of its times: "ms", "iso", or of `strptime`.
-    """
+    Files are Parquet or CSV, with times in "ms", in "iso" or in a format of `strptime`."""
     frames = [_part(path, written) for path, written in files]
     log = pd.concat(frames, ignore_index=True)
     log = log[np.isfinite(log["reward"].astype(float))].dropna()

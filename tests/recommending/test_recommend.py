@@ -324,10 +324,11 @@ def test_wrong_histories_are_refused(policy: Recommender, log: pd.DataFrame, cas
 
 def test_draws_depend_on_user_request_item_and_seed_alone() -> None:
     users, requests = np.array([3, 5, 8]), np.array(["a", "b", "c"])
-    drawn = uniforms(users, requests, 2000, 0)
-    assert torch.equal(uniforms(users[1:2], requests[1:2], 500, 0)[0], drawn[1, :500])
-    assert not torch.equal(uniforms(users, requests, 2000, 1), drawn)
-    same_user = uniforms(users[[0, 0, 0]], requests, 2000, 0)
+    items = np.arange(2000)[None]
+    drawn = uniforms(users, requests, items, 0)
+    assert torch.equal(uniforms(users[1:2], requests[1:2], items[:, 9:], 0)[0], drawn[1, 9:])
+    assert not torch.equal(uniforms(users, requests, items, 1), drawn)
+    same_user = uniforms(users[[0, 0, 0]], requests, items, 0)
     for several in (drawn, same_user):
         assert ((several >= 0) & (several < 1)).all()
         np.testing.assert_allclose(several.mean(1), 0.5, atol=0.03)
@@ -447,9 +448,8 @@ def some_left_out(sessions: Sessions) -> tuple[Tensor, Tensor]:
 def test_a_search_of_all_lists_is_exact(opinionated: TrainedPolicy, rule: DecisionRule) -> None:
     asked, scorer = random_sessions(opinionated, rule), opinionated.scorer(rule)
     left_out, index = some_left_out(asked), ItemIndex(scorer, "ucf")
-    excluded = torch.arange(24) == 7
-    items, values = index.best(asked, left_out, excluded, 6)
-    exact = scorer.scores(asked, left_out, excluded, empty=True)
+    items, values = index.best(asked, left_out, 6)
+    exact = scorer.scores(asked, left_out, empty=True)
     expected = exact.topk(6)
     torch.testing.assert_close(exact.gather(1, items), expected.values, rtol=1e-5, atol=1e-5)
     relative = expected.values - expected.values[:, :1]
@@ -467,7 +467,7 @@ def test_what_is_found_has_its_score_and_the_recall_is_told(
     asked, scorer = random_sessions(opinionated, rule), opinionated.scorer(rule)
     nothing = (torch.empty(0, dtype=torch.int64),) * 2
     index = ItemIndex(scorer, "ucf")
-    items, values = index.best(asked, nothing, None, 2)
+    items, values = index.best(asked, nothing, 2)
     exact = scorer.scores(asked)
     theirs = exact.gather(1, items)
     torch.testing.assert_close(values, theirs - theirs[:, :1], rtol=1e-4, atol=1e-4)

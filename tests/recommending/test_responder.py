@@ -32,6 +32,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.recommending import recommend as module
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.requests import HistoryReader, Request, Row, RowRewards
@@ -58,14 +59,18 @@ def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: obje
     return pd.concat(recommend(trained, batches, k, **named), ignore_index=True)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
+with_rules = pytest.mark.parametrize(
     "rule",
     [
         *(None, FULL, replace(FULL, by_marginal_gain=True)),
+        DecisionRule(1.0, reward_weight=3.0, tag_run=1),
         DecisionRule(3.0, temperature=0.7, top_k=9, explore=0.5, explore_top=12),
     ],
-    ids=["own", "full", "in turn", "drawn"],
+    ids=["own", "full", "in turn", "run", "drawn"],
 )
+
+
+@with_rules
 @pytest.mark.parametrize("keep_seen", [False, True])
 def test_answers_are_those_of_recommend(
     trained: TrainedPolicy, rule: DecisionRule | None, keep_seen: bool
@@ -103,6 +108,26 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         own = found[found.user_id == user].reset_index(drop=True)
         expected["request_id"] = own.request_id
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
+
+
+@with_rules
+def test_candidates_of_a_large_catalogue_are_scored_without_the_others(
+    trained: TrainedPolicy, rule: DecisionRule | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, by, asked = (
+        np.random.default_rng(0),
+        responder(trained, rule=rule),
+        requests_of(histories()),
+    )
+    for number, request in enumerate(asked):
+        some = rng.integers(24, size=1 + number % 16).tolist()
+        request |= {"request_id": str(number), "candidates": some if number % 4 else None}
+    expected = answered(by, asked)
+    for name in ("_LARGE", "_SPARSE"):
+        monkeypatch.setattr(module, name, 1)
+    alone = pd.concat([answered(by, [each]) for each in asked], ignore_index=True)
+    for found in (answered(by, asked), alone):
+        pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
 @given(ids=st.lists(st.integers(-9, 30) | st.sampled_from([-(2**63), 2**63 - 1, "3", "99"])))

@@ -16,8 +16,6 @@ from ucfrec.results.rows import append_rows, write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
-_CAPTION = " with 95% intervals, and other measures"
-
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -2,8 +2,7 @@
 
     python killed_loop.py run|update|promote|join|exposures FOLDER
 
-Prints how many were killed. What a kill leaves is checked here, the end by the caller.
-"""
+Prints how many were killed. What a kill leaves is checked here, the end by the caller."""
 
 import random
 import sys

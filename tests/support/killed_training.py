@@ -2,8 +2,7 @@
 
     python killed_training.py SEED FOLDER
 
-Prints how many were killed and what the last loop returned. Each is a fork of one interpreter.
-"""
+Prints how many were killed and what the last loop returned. Each is a fork of one interpreter."""
 
 import json
 import os

@@ -37,10 +37,8 @@ def replayed(
     rewards: Sequence[float],
     user: Any = None,
 ) -> Tensor:
-    """Probabilities (T + 1, n_items) before each of the T steps of a session, and after them.
-
-    `items` are indices, of a policy without observations; `user` None is not in the logs.
-    """
+    """Probabilities (T + 1, n_items) before each of the T steps of a session, and after them, of a
+    policy without observations; `items` are indices, and a `user` None is not in the logs."""
     told = Told.of(rule, [*items, 0])
     actor = trained.actor(1, told)
     actor.begin(np.array([0]))

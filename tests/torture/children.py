@@ -49,11 +49,8 @@ class End:
 
 
 class Running:
-    """A function in a fork; its stderr goes to a file, its stdout to nowhere.
-
-    With `memory`, the fork gets no more than that many bytes beyond what this process has; with
-    `largest`, no file may have more bytes.
-    """
+    """A function in a fork; its stderr goes to a file, its stdout to nowhere. `memory` is the most
+    bytes beyond what this process has, `largest` the most that a file may have."""
 
     def __init__(
         self, work: Callable[[], int], memory: int | None = None, largest: int | None = None
@@ -122,10 +119,8 @@ def command(*arguments: object) -> Callable[[], int]:
 
 
 def run_first(work: Callable[[], int]) -> End:
-    """Run in a fork, after which this interpreter imports what the fork imported.
-
-    Forks then spend their time on what the command does, not on its imports.
-    """
+    """Run in a fork, after which this interpreter imports what the fork imported: later forks spend
+    their time on what the command does."""
     with tempfile.NamedTemporaryFile("r") as names:
 
         def listed() -> int:
@@ -144,11 +139,9 @@ def run_first(work: Callable[[], int]) -> End:
 def traced(
     work: Callable[[], int], place: Path, answer: Path, at: tuple[int, int] = (-1, -1)
 ) -> Callable[[], int]:
-    """The work, in a fork that kills itself `at` a call after a step.
-
-    A step opens a file in `place` to write it, makes a folder there or renames something, or opens
-    Parquet. If all ends well, `answer` lists the steps and the number of calls until the next.
-    """
+    """The work, in a fork that kills itself `at` a call after a step: one that opens a file in
+    `place` to write it, makes a folder there, renames something, or opens Parquet. If all ends
+    well, `answer` lists the steps and the number of calls until the next."""
     steps: list[tuple[str, int]] = []
 
     def count(frame: FrameType, event: str, _: object) -> None:

@@ -1,7 +1,5 @@
-"""Versions of ucfrec with one guard less, by the check and the part of it that must find each.
-
-A mutant is the name of a function or class of ucfrec and what replaces it; nothing else changes.
-"""
+"""Versions of ucfrec with one guard less, by the check and the part of it that must find each: the
+name of a function or class of ucfrec and what replaces it."""
 
 import json
 from collections.abc import Iterator

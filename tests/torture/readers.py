@@ -1,10 +1,8 @@
-"""Every reader on files with flipped bits and with other content.
+"""Every reader on files with flipped bits and with other content, in a copy of the folder.
 
-A reader gets a copy of the folder that it reads. A flipped bit must be found, or change nothing
-that is read. After a mutation the record of the folder is sealed again: its checksums would find
-every change. The first mutant is no file of any kind; a reader that does not refuse it reads
-another file.
-"""
+A flipped bit must be found, or change nothing that is read. After a mutation the record of the
+folder is sealed again: its checksums would find every change. The first mutant is no file of any
+kind; a reader that does not refuse it reads another file."""
 
 import errno
 import json

@@ -181,11 +181,8 @@ class DecisionRule:
         return [(share, logs.double().maximum(last)) for share, logs in modes]
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Items (B,) and the probabilities (B,) with which they were chosen.
-
-        Args:
-            scores: (B, n_items) of `Scorer.scores`.
-        """
+        """Items (B,) of scores (B, n_items), and the probabilities (B,) with which they were
+        chosen."""
         if not self.draws:
             return _best(scores), torch.ones(len(scores))
         probabilities = self.log_probabilities(scores).exp_()
@@ -326,12 +323,8 @@ def _only_best(scores: Tensor, count: int | None) -> Tensor:
 
 
 def _conditional(logs: Tensor, items: Tensor) -> Tensor:
-    """Log-probabilities (B, k) of items drawn without replacement, each given those before it.
-
-    Args:
-        logs: (B, n) float64 log-probabilities of a single draw.
-        items: (B, k) in the order drawn.
-    """
+    """Log-probabilities of items (B, k) drawn in this order without replacement, each given those
+    before it, from the log-probabilities (B, n) float64 of a single draw."""
     of_items = logs.gather(1, items)
     remainder = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
     # What is left before each draw is summed from the end, so that nothing cancels.
@@ -363,10 +356,8 @@ def best_items(scores: Tensor, k: int) -> Tensor:
 
 
 def _best(scores: Tensor) -> Tensor:
-    """Numbers (B,) of the highest scores (B, n), the first of equal ones.
-
-    NumPy finds them ten times as fast as torch.
-    """
+    """Numbers (B,) of the highest scores (B, n), the first of equal ones."""
+    # NumPy finds them ten times as fast as torch.
     return torch.from_numpy(scores.numpy().argmax(1))
 
 

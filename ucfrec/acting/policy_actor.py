@@ -113,6 +113,7 @@ class PolicyActor:
     @torch.no_grad()
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
         """Choose the actions of the live rows; other rows take the first item that is allowed.
+        InputError if every item is forbidden in some live row.
 
         Args:
             observations: (N, O) with all entries that the policy sees.
@@ -121,9 +122,6 @@ class PolicyActor:
         Returns:
             (N, A) vectors and None; or (N,) indices of the environment's items and the
             probabilities (N,) with which they were chosen, 1 in rows that are not live.
-
-        Raises:
-            InputError: every item is forbidden in some live row.
         """
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, self._observed]
         latest = observed

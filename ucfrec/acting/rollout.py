@@ -137,16 +137,13 @@ def rollout(
     """Roll out exactly `episodes` episodes.
 
     Environment i of N simulates episodes i, i + N, i + 2N, …: with a fixed assignment, short
-    episodes are not over-represented.
+    episodes are not over-represented. InputError if the environment does not reset within the step,
+    or forbids actions (`FORBIDDEN`) and the actor has no `inform`.
 
     Args:
         env: N environments, reset within the step (`AutoresetMode.SAME_STEP`).
         seed: environment i is seeded with `seed` + i.
         on_step: called after each step with the rows that belong to one of the `episodes`.
-
-    Raises:
-        InputError: the environment does not reset within the step, or forbids actions (`FORBIDDEN`)
-            and the actor has no `inform`.
     """
     if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         raise InputError(

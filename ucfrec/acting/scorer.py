@@ -99,19 +99,18 @@ class Scorer:
         reward_model: ItemRewardModel | None = None,
         session_end: SessionEnd | None = None,
     ) -> None:
-        """
+        """InputError if the rule needs what the run lacks.
+
         Args:
             policy: in evaluation mode; its weights must not change after the first scores.
             states: of the run's items; None if actions are vectors.
             returns: what the returns-to-go of the training counted; None for whole sessions.
             reward_model: f̂_r; needed for a reward weight.
             session_end: of the user model; needed for a lookahead.
-
-        Raises:
-            InputError: the rule needs what the run lacks.
         """
         self.policy, self.rule, self.states = policy, rule, states
-        self.returns, self.reward_model = returns or ReturnToGo(), reward_model
+        self.returns = returns or ReturnToGo()
+        self.reward_model = reward_model
         self.session_end = session_end
         self._has_two_rewards = reward_model is not None and bool(reward_model.binary)
         self._items = _ItemProduct(policy, reward_model, states)
@@ -129,7 +128,8 @@ class Scorer:
         return scorer
 
     def _require_parts(self) -> None:
-        rule, tags = self.rule, None if self.states is None else self.states.tags
+        rule = self.rule
+        tags = None if self.states is None else self.states.tags
         if rule.reward_weight and self.reward_model is None:
             raise InputError(
                 f"the rule has reward weight {rule.reward_weight:g}, but the run has no "
@@ -213,11 +213,8 @@ class Scorer:
 
     @torch.no_grad()
     def windows(self, sessions: Sessions) -> Windows:
-        """What the policy reads of sessions, with the returns-to-go that the rule sets as target.
-
-        Args:
-            sessions: as of `scores`, or of vector actions with states.
-        """
+        """What the policy reads of sessions, of items or, with states, of vector actions; the
+        returns-to-go are those that the rule sets as target."""
         windows = sessions.windows(self.states, self.policy.config.context)
         targets = self.rule.target_returns(self.returns, sessions.collected)
         returns_to_go = self.returns.before(targets, windows.rewards)
@@ -238,10 +235,8 @@ class Scorer:
     ) -> Query:
         """All of the scores that does not grow with the items, before it is weighted.
 
-        Args:
-            windows: of `windows`; None to make them.
-            rewards: whether it is also used under rules with a reward weight; None if this one
-                has one.
+        `windows` are made if they are None. `rewards` says whether it is also used under rules with
+        a reward weight, by default if this one has one.
         """
         windows = self.windows(sessions) if windows is None else windows
         rewards = bool(self.rule.reward_weight) if rewards is None else rewards
@@ -356,28 +351,37 @@ class Scorer:
         query: Query,
         part: Part,
         candidates: Tensor,
-        products: Tensor,
+        left_out: tuple[Tensor, Tensor],
+        products: Tensor | None = None,
     ) -> Tensor:
-        """Scores (B, C) of some items; −∞ for those that the rule's tags exclude, even if no
-        others remain.
+        """Scores (B, C) of some items, without a look at the others, if the rule `is_product`.
 
         Args:
             part: of `weigh`.
-            candidates: (B, C) int64.
-            products: (B, C) of the part's factors, and 1, with the candidates' `vectors`.
+            candidates: (B, C) int64, sorted but for −1, which is none; repeated ones count once.
+            left_out: rows (N,) and items (N,) of what may not be shown.
+            products: (B, C) of the part's factors, and 1, with the candidates' `vectors`, of items
+                that are not all: a tag filter does not give way, even if no others remain.
         """
+        missing, items = candidates < 0, candidates.clamp(min=0)
+        missing[:, 1:] |= candidates[:, 1:] == candidates[:, :-1]
         rewards = bool(self.rule.reward_weight)
-        scores = products + self._items.addends(query.items, part, candidates, rewards)
+        gives_way = products is None
+        scores = self._items.scores_of_some(query.items, part, items, products, rewards)
         if query.sessions.offer is not None:
             if rewards:
-                running = self._sum_running(query.sessions).expand(
-                    len(candidates), self._items.count
-                )
-                scores = scores + self.rule.reward_weight * running.gather(1, candidates)
-            offered = query.sessions.offer.mask().gather(1, candidates)
-            scores = scores.masked_fill(~offered, -torch.inf)
-        for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
-            scores = scores.masked_fill(without, -torch.inf)
+                running = self._sum_running(query.sessions).expand(len(items), self._items.count)
+                scores = scores + self.rule.reward_weight * running.gather(1, items)
+            missing |= ~query.sessions.offer.mask().gather(1, items)
+        _require_scores(scores, empty=True)
+        # Pairs of a row and an item are single numbers.
+        rows = torch.arange(len(items)).unsqueeze(1) * self._items.count
+        missing |= torch.isin(rows + items, left_out[0] * self._items.count + left_out[1])
+        scores = scores.masked_fill(missing, -torch.inf)
+        for without in self._items.without_tags(self.rule, query.sessions.shown, items):
+            left = scores.masked_fill(without, -torch.inf)
+            some = left.amax(1, keepdim=True) > -torch.inf
+            scores = torch.where(some, left, scores) if gives_way else left
         return scores
 
     def _add_lookahead(
@@ -397,8 +401,10 @@ class Scorer:
         users, recent = query.sessions.users, query.sessions.shown
         tastes = model.tastes_after(query.sessions.shown_since.latest(model.reach), users)
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
-        span, steps = model.reward_high - model.reward_low, query.sessions.steps
-        weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
+        span = model.reward_high - model.reward_low
+        steps = query.sessions.steps
+        weight = self.rule.reward_weight / span
+        ahead = self.rule.lookahead
         rewards = model.expect(odds)
         scores = scores + weight * rewards
         best = best_items(scores, min(_LOOKED_AT, self._items.count))
@@ -581,22 +587,29 @@ class _ItemProduct:
         repeated = part.repeated.masked_fill(items < 0, 0.0)
         return scores.scatter_add_(1, items.clamp(min=0), repeated)
 
-    def addends(
+    def scores_of_some(
         self,
         items: Tensor,
         part: Part,
         candidates: Tensor,
+        products: Tensor | None,
         rewards: bool,
     ) -> Tensor:
-        """(B, C) what scores of the policy are more than products, for candidates (B, C)."""
-        added = torch.zeros(candidates.shape)
+        """(B, C) as `scores` of candidates (B, C), from what was shown and weighted parts; the
+        products with their vectors may be known."""
+        if products is None:
+            matrix, bias = self.rows(True, rewards)
+            vectors = matrix.index_select(1, candidates.flatten())
+            vectors = vectors.view(-1, len(candidates), candidates.shape[1])
+            products = torch.einsum("bd,dbc->bc", part.factors, vectors)
+            products += bias.expand(self.count)[candidates]
         if not self._counts_shown(True, rewards):
-            return added
+            return products
         if self._alike is not None and not self._by_direction:
             profile = self._alike.profile(items, part.alike)
-            added += self._alike.to_candidates(profile, candidates)
+            products = products + self._alike.to_candidates(profile, candidates)
         same = candidates.unsqueeze(2) == items.unsqueeze(1)
-        return added + (same * part.repeated.unsqueeze(1)).sum(2)
+        return products + (same * part.repeated.unsqueeze(1)).sum(2)
 
     def without_tags(
         self,

@@ -91,14 +91,12 @@ def export(
     """Write a folder with the graph (`model.onnx`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
+    InputError if the extra `export` is not installed, the policy cannot be exported, the graph's
+    scores differ from torch's, or `out` exists.
 
     Args:
         rule: the decision rule; None for the run's own.
         k: number of best items of the output; None for 100, or all items if there are fewer.
-
-    Raises:
-        InputError: the extra `export` is not installed, the policy cannot be exported, the graph's
-            scores differ from torch's, or `out` exists.
     """
     require_installed()
     graph = RuleGraph(trained.item_scorer(rule), trained.name, k).eval()
@@ -204,13 +202,9 @@ def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 def compile_scores(scorer: Scorer, kind: str) -> Callable[[Sessions, Tensor], Tensor]:
     """`Scorer.scores` of one session, given what (1, n_items) bool may not be shown, by onnxruntime
-    and one thread.
-
-    Raises:
-        InputError: the extra `export` is not installed, the policy scores items in a way of its own
-            or cannot be exported, the rule looks ahead over items that come and go, or what the
-            graph gives differs from torch's.
-    """
+    and one thread. InputError if the extra `export` is not installed, the policy scores items in a
+    way of its own or cannot be exported, the rule looks ahead over items that come and go, or what
+    the graph gives differs from torch's."""
     require_installed()
     model = scorer.reward_model
     if scorer.rule.looks_ahead and model is not None and model.running.any():

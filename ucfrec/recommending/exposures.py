@@ -136,11 +136,15 @@ class ExposureLog:
             what = explain_os_error(error)
             raise InputError(f"{folder} cannot be written ({what}); name another folder") from None
         self._folder, self._schema = folder, exposure_schema(trained)
-        self._rows, self._seconds, self._clock = rows, seconds, clock
+        self._rows = rows
+        self._seconds = seconds
+        self._clock = clock
         self._waiting: list[tuple[str, int, str, Answer]] = []
         self._sets: dict[str, Array | None] = {}
         self._count, self._ids, self._lost = 0, 0, 0
-        self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
         self._thread.start()
 

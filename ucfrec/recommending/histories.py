@@ -32,13 +32,8 @@ def histories_of_files(
 ) -> Iterator[Histories]:
     """Read histories from log files, folders and globs in batches of users, in sorted order.
 
-    Args:
-        trained: policy whose reward expression, session rule and observations apply.
-        mapping: names of the columns; what it leaves open is as in the training log.
-        memory_limit: of the process, such as "2GB"; rows spill to disk.
-
-    Raises:
-        InputError: a file or a column is missing, or has values that cannot be used.
+    What the mapping leaves open is as in the training log. Rows beyond the memory limit, such as
+    "2GB", spill to disk. InputError if a file or column is missing, or a value cannot be used.
     """
     return read_histories(
         files,

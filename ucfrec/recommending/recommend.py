@@ -36,6 +36,9 @@ _USERS_AT_ONCE = 128
 _SCORES = 2**23
 """Most scores of a forward pass of several users, users × items: 32 MiB, as memory for more is
 given back after every pass, and asking for it anew takes as long as the product."""
+_LARGE, _SPARSE = 2**16, 16
+"""Candidates are scored without the other items of catalogues from this size on, if they are at
+most one item in so many; in smaller ones, the product with all is as fast."""
 _ITEMS_AT_ONCE = 1024
 _NEGLIGIBLE = 80.0
 """Nats below the best score from which on an item counts nothing, in float32."""
@@ -116,15 +119,13 @@ def decide(
     if at_ms is None and trained.offers is not None:
         at_ms = round(time.time() * 1000)
     chooser = Chooser(trained, trained.item_scorer(rule), seed, index, at_ms)
-    k, excluded, remaining = require_whole("k", k), None, iter(batches)
+    k, allowed, remaining = require_whole("k", k), None, iter(batches)
     told_apart = "" if at_ms is None else f"-{at_ms}"
     if candidates is not None:
         ids = require_ids("candidates", candidates, schema.ITEM_ID)
-        excluded = torch.ones(len(trained.items), dtype=torch.bool)
-        allowed = candidate_numbers(trained.items, ids, skip_unknown)
+        allowed = np.sort(candidate_numbers(trained.items, ids, skip_unknown))
         told_apart += f"-{name_set(trained.items.ids[allowed])}"
-        excluded[torch.from_numpy(allowed)] = False
-    _require_available(trained, chooser.request_times(1), excluded)
+    _require_available(trained, chooser.request_times(1), allowed)
 
     def to_frame(batch: Histories) -> tuple[pd.DataFrame, IntArray]:
         histories = batch.with_numbers(trained.items, filter_seen)
@@ -135,7 +136,8 @@ def decide(
         np.maximum.at(last, batch.owner, batch.timestamps)
         requests = np.asarray([f"{seed}-{ms}{told_apart}" for ms in last.tolist()], dtype=object)
         new = np.full(len(histories.users), new_session)
-        items, scores, propensities, began = chooser.choose(histories, requests, k, new, excluded)
+        candidates = [allowed] * len(new)
+        items, scores, propensities, began = chooser.choose(histories, requests, k, new, candidates)
         left = np.isfinite(scores)
         counts = left.sum(1)
         frame = pd.DataFrame(
@@ -153,14 +155,14 @@ def decide(
     return map(to_frame, remaining)
 
 
-def _require_available(trained: TrainedPolicy, time: Tensor, excluded: Tensor | None) -> None:
+def _require_available(trained: TrainedPolicy, time: Tensor, allowed: IntArray | None) -> None:
     """Check that some item, or candidate, is available at a time (1,) in ms."""
     if trained.offers is None:
         return
-    offered = trained.offers.at(time).mask()
-    if not (offered if excluded is None else offered & ~excluded).any():
+    offered = trained.offers.at(time).mask()[0]
+    if not (offered if allowed is None else offered[allowed]).any():
         clock = pd.Timestamp(int(time), unit="ms")
-        none = "no item" if excluded is None else f"none of {int((~excluded).sum())} candidates"
+        none = "no item" if allowed is None else f"none of {len(allowed)} candidates"
         raise InputError(
             f"{trained.folder}: {none} is available at {clock:%Y-%m-%d %H:%M} UTC; give the time "
             "of requests with --at (at=... in Python), or a newer table of items to ucfrec update"
@@ -200,8 +202,7 @@ class Chooser:
         requests: Array,
         k: int,
         new: BoolArray,
-        excluded: Tensor | None = None,
-        candidates: Sequence[IntArray | None] = (),
+        candidates: Sequence[IntArray | None],
     ) -> tuple[Array, Array, Array, IntArray]:
         """Items (U, k) in the order shown, their log-probabilities at temperature 1, −∞ where no
         more may be shown, their propensities, and when the sessions (U,) began, ms, −1 for now.
@@ -211,30 +212,30 @@ class Chooser:
             requests: (U,) text that tells a user's requests apart.
             k: number of items; of a smaller catalogue, all.
             new: (U,) users who begin a new session.
-            excluded: (n_items,) true for items that no user is recommended.
-            candidates: of every user the only items to recommend, None for all; empty for all.
+            candidates: of every user the only items to recommend, sorted; None for all.
         """
         in_catalogue = histories.item_ids >= 0
         histories = histories if in_catalogue.all() else histories.with_rows(in_catalogue)
         latest = histories.latest_session(self.trained.record.session_gap_ms, new)
-        at_once, count = _USERS_AT_ONCE, len(self.trained.items)
-        if self.index is None:
-            at_once = max(1, min(_USERS_AT_ONCE, _SCORES // count))
+        n_items = len(self.trained.items)
+        k = min(k, n_items)
         # Sessions of about the same length share a pass, which costs as much as the longest.
-        order = np.argsort(np.bincount(latest.owner, minlength=len(new)), kind="stable")
+        limited = np.array([some is not None for some in candidates], dtype=bool)
+        order = np.lexsort((np.bincount(latest.owner, minlength=len(new)), limited))
         parts = []
-        for first in range(0, len(order), at_once):
-            users = order[first : first + at_once]
-            part = latest if len(order) == 1 else latest.of_users(users)
-            without = excluded
-            if any(allowed is not None for allowed in candidates):
-                left_out = np.zeros((len(users), count), dtype=bool)
-                for row, user in enumerate(users.tolist()):
-                    if (allowed := candidates[user]) is not None:
-                        left_out[row] = True
-                        left_out[row, allowed] = False
-                without = torch.from_numpy(left_out)
-            parts.append(self._choose_together(part, requests[users], min(k, count), without))
+        for group in np.split(order, [len(order) - int(limited.sum())]):
+            lists = [some for user in group.tolist() if (some := candidates[user]) is not None]
+            width = max(k, max(map(len, lists), default=0))
+            alone = self.scorer.is_product and n_items >= max(_LARGE, _SPARSE * width)
+            count = _SPARSE * width if lists and alone else n_items
+            at_once = _USERS_AT_ONCE
+            if lists or self.index is None:
+                at_once = max(1, min(at_once, _SCORES // count))
+            for first in range(0, len(group), at_once):
+                users = group[first : first + at_once]
+                part = latest if len(order) == 1 else latest.of_users(users)
+                some = _pad_lists(lists[first : first + at_once], width) if lists else None
+                parts.append(self._choose_together(part, requests[users], k, some, alone))
         back = np.argsort(order, kind="stable")
         items, scores, propensities = (
             np.concatenate(arrays)[back] for arrays in zip(*parts, strict=True)
@@ -249,28 +250,45 @@ class Chooser:
         latest: Histories,
         requests: Array,
         k: int,
-        excluded: Tensor | None,
+        candidates: Tensor | None,
+        alone: bool,
     ) -> tuple[Array, Array, Array]:
-        """`choose` with one forward pass, of latest sessions."""
+        """`choose` with one forward pass, of latest sessions and candidates (U, C), −1 for none,
+        which may be scored alone, without the other items."""
         rule = self.scorer.rule
+        n_items = len(self.trained.items)
+        excluded = None
         sessions = sessions_of(self.trained, latest, self.scorer.length)
         if self.trained.offers is not None:
             offer = self.trained.offers.at(self.request_times(len(requests)))
             sessions = replace(sessions, offer=offer)
         # What was seen, and what the latest sessions have shown, if the rule excludes it.
         in_catalogue = latest.seen_ids >= 0
-        rows, seen = latest.seen_owner[in_catalogue], latest.seen_ids[in_catalogue]
+        rows = latest.seen_owner[in_catalogue]
+        seen = latest.seen_ids[in_catalogue]
         if rule.exclude_seen:
             rows = np.concatenate([rows, latest.owner])
             seen = np.concatenate([seen, latest.item_ids])
         left_out = torch.from_numpy(rows), torch.from_numpy(seen)
-        if self.index is not None:
-            best, values = self.index.best(sessions, left_out, excluded, k)
+        if candidates is None and self.index is not None:
+            best, values = self.index.best(sessions, left_out, k)
             return best.numpy(), values.numpy(), np.ones(best.shape)
-        scores = self.scorer.scores(sessions, left_out, excluded, empty=True)
+        if candidates is not None and alone:
+            query = self.scorer.query(sessions)
+            part = self.scorer.weigh(query)
+            scores = self.scorer.scores_of_some(query, part, candidates, left_out)
+        else:
+            if candidates is not None:
+                excluded = torch.ones(len(candidates), n_items + 1, dtype=torch.bool)
+                excluded[torch.arange(len(candidates)).unsqueeze(1), candidates] = False
+                candidates, excluded = None, excluded[:, :-1]  # the last column is that of −1
+            scores = self.scorer.scores(sessions, left_out, excluded, empty=True)
         draws = None
         if rule.draws:
-            draws = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
+            counters = torch.arange(n_items + 1).unsqueeze(0)
+            if candidates is not None:
+                counters = F.pad(candidates, (0, 1), value=n_items)
+            draws = uniforms(latest.users, requests, counters.numpy(), self.seed)
         with torch.inference_mode():
             highest = scores.amax(-1, keepdim=True)
             none = torch.isneginf(highest)
@@ -282,7 +300,16 @@ class Chooser:
             # Exponentials that underflow take long; what is lower adds nothing to a sum from 1 on.
             totals = scores.sub_(highest).clamp_(min=-_NEGLIGIBLE).exp_().sum(-1, keepdim=True)
             values = values.sub_(totals.log_().add_(highest)).masked_fill_(none, -torch.inf)
+            items = items if candidates is None else candidates.gather(1, items)
             return items.numpy(), values.numpy(), propensities.numpy()
+
+
+def _pad_lists(lists: Sequence[IntArray], width: int) -> Tensor:
+    """The numbers of each list (U, width), and −1."""
+    padded = torch.full((len(lists), width), -1)
+    for row, numbers in zip(padded, lists, strict=True):
+        row[: len(numbers)] = torch.from_numpy(numbers)
+    return padded
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
@@ -316,15 +343,9 @@ def name_some(values: Sequence[Any]) -> str:
 
 
 def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Sessions:
-    """The sessions of users, each before the step for which items are scored.
-
-    Args:
-        histories: U users with the N rows of their latest sessions, of `with_numbers`.
-        length: items of a session that are read.
-
-    Raises:
-        InputError: the policy needs observations that the histories lack.
-    """
+    """The sessions of users, each before the step for which items are scored, from the rows of
+    their latest sessions, of `with_numbers`, of which `length` items are read. InputError if the
+    policy needs observations that the histories lack."""
     expected, observations = trained.record.observation_size, None
     if expected:
         logged = histories.observations
@@ -337,7 +358,9 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
         context = trained.policy.config.context
         observations = torch.tensor(logged).unsqueeze(1).expand(-1, context, -1)
     users = trained.users.numbers(histories.users)
-    owner, items, rewards = histories.owner, histories.item_ids, histories.rewards
+    owner = histories.owner
+    items = histories.item_ids
+    rewards = histories.rewards
     sessions = Sessions.from_rows(owner, items, rewards, users, length, observations)
     if (model := trained.reward_model) is None:
         return sessions
@@ -348,14 +371,11 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
 def uniforms(
     users: Array,
     requests: Array,
-    count: int,
+    counters: IntArray,
     seed: int,
 ) -> Tensor:
-    """Draws (B, count) from [0, 1), float64, that depend on the user, the request and the seed.
-
-    A request is answered the same in any batch. The numbers are SplitMix64's (Steele et al., 2014),
-    from a counter of hashes and items.
-    """
+    """Draws (B, C) from [0, 1), float64, that depend on the user, the request, the seed and the
+    counters (B or 1, C): the same in any batch. They are SplitMix64's (Steele et al., 2014)."""
     of_users, of_requests = (
         pd.util.hash_array(np.asarray(ids).astype(str).astype(object)) for ids in (users, requests)
     )
@@ -363,7 +383,7 @@ def uniforms(
     with np.errstate(over="ignore"):
         key = of_users + mix_bits(of_requests) - step
         state = mix_bits(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
-        state = mix_bits(state + np.arange(count, dtype=np.uint64) * step)
+        state = mix_bits(state + counters.astype(np.uint64) * step)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
 
 
@@ -372,13 +392,13 @@ class ItemIndex:
     scores these exactly.
 
     Lists are chosen by the product with the items' vectors. What was shown (repetition, shared
-    tags) and what is excluded counts among the candidates found, not in finding them. Sessions of
-    which too few candidates are left are scored exactly.
+    tags) counts among the candidates found, not in finding them. Sessions of which too few are left
+    are scored exactly.
     """
 
     def __init__(self, scorer: Scorer, kind: str) -> None:
-        """Index the items of a policy, whose weights must not change afterwards; InputError if
-        faiss is not installed, or the rule or the policy need scores of all items."""
+        """Index the items of a policy, whose weights must not change; InputError if faiss is
+        missing, or the rule or the policy need scores of all items."""
         try:
             import faiss
         except ModuleNotFoundError:
@@ -416,33 +436,21 @@ class ItemIndex:
         self,
         sessions: Sessions,
         left_out: tuple[Tensor, Tensor],
-        excluded: Tensor | None,
         k: int,
     ) -> tuple[Tensor, Tensor]:
-        """`k` items (B, k), best first, and their scores (B, k) less that of the best, nats; −∞
-        where fewer are left.
-
-        Args:
-            sessions: B sessions; see `Scorer.scores`.
-            left_out: rows (N,) and items (N,) of what may not be recommended.
-            excluded: (n_items,) bool, what no user is recommended.
-            k: at most the number of items.
-        """
+        """`k` items (B, k) of sessions, best first, without what is `left_out` (see
+        `Scorer.scores`), and their scores (B, k) less that of the best, nats; −∞ where fewer are
+        left."""
         scorer, n_items = self._scorer, self._index.ntotal
         query = scorer.query(sessions)
-        part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
+        part = scorer.weigh(query)
+        count = min(n_items, 4 * k + _MORE)
         factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
         products, numbers = map(torch.from_numpy, self._index.search(factors, count))
         # Of equal scores, the lowest number comes first.
-        numbers, order = numbers.sort()
-        candidates, missing = numbers.clamp(min=0), numbers < 0
-        if excluded is not None:
-            missing |= excluded[candidates]
-        # Pairs of a row and an item are single numbers.
-        rows = torch.arange(len(numbers)).unsqueeze(1) * n_items
-        missing |= torch.isin(rows + candidates, left_out[0] * n_items + left_out[1])
-        scores = scorer.scores_of_some(query, part, candidates, products.gather(1, order))
-        scores = scores.masked_fill(missing, -torch.inf)
+        candidates, order = numbers.sort()
+        products = products.gather(1, order)
+        scores = scorer.scores_of_some(query, part, candidates, left_out, products)
         best = best_items(scores, k)
         items, scores = candidates.gather(1, best), scores.gather(1, best)
         short = torch.isneginf(scores[:, -1])
@@ -452,7 +460,7 @@ class ItemIndex:
             items_out = left_out[1][left_out[0] == row]
             row_out = torch.zeros_like(items_out), items_out
             session = sessions.at(torch.tensor([row]))
-            exact = scorer.scores(session, row_out, excluded, empty=True)
+            exact = scorer.scores(session, row_out, empty=True)
             best = best_items(exact, k)[0]
             if short[row]:
                 items[row], scores[row] = best, exact[0, best]
@@ -471,17 +479,14 @@ def similar_items(
     """The `k` most similar other items of each item, by the cosine of the items' vectors.
 
     The vectors are those by which the policy scores items; of a policy that scores items in a way
-    of its own, such as `item-knn`, the store's embeddings of the items.
+    of its own, such as `item-knn`, the store's embeddings of the items. InputError if the policy's
+    actions are vectors, an item is not known, or `items` or `k` is something else.
 
     Args:
         items: item_ids; None for all.
 
     Returns:
         `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
-
-    Raises:
-        InputError: the policy's actions are vectors, an item is not known, or `items` or `k` is
-            something else.
     """
     k, ids = require_whole("k", k), trained.items.ids
     chosen = ids if items is None else require_ids("items", items, schema.ITEM_ID)

@@ -119,16 +119,13 @@ class Responder:
         seed: int = 0,
         engine: str = "torch",
     ) -> None:
-        """As `recommend`; draws depend on user and request_id.
+        """As `recommend`; draws depend on user and request_id. InputError if the policy's actions
+        are vectors, the rule does not fit the policy, `k` is beyond the limits, or the engine is
+        not installed or cannot compute the policy.
 
         Args:
             k: items for requests that do not say how many.
-            engine: what computes the scores of a request that comes alone, "torch" or
-                "onnxruntime".
-
-        Raises:
-            InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
-                beyond the limits, or the engine is not installed or cannot compute the policy.
+            engine: "torch" or "onnxruntime", which computes the scores of single requests.
         """
         scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
@@ -137,9 +134,13 @@ class Responder:
             from ucfrec.recommending.export import compile_scores
 
             scorer.engine = compile_scores(scorer, trained.name)
-        self.trained, self.limits, self.rule = trained, limits, scorer.rule
+        self.trained = trained
+        self.limits = limits
+        self.rule = scorer.rule
         self._chooser = Chooser(trained, scorer, seed)
-        self._k, self._filter_seen, self._skip_unknown = k, filter_seen, skip_unknown
+        self._k = k
+        self._filter_seen = filter_seen
+        self._skip_unknown = skip_unknown
         self._source = trained.fingerprint, self.rule.hash
         self._reader = HistoryReader(
             trained.record.data.duplicates,
@@ -220,7 +221,7 @@ class Responder:
             np.asarray([question.request_id for question in questions], dtype=object),
             max(question.k for question in questions),
             np.asarray([question.request.new_session for question in questions]),
-            candidates=[question.candidates for question in questions],
+            [question.candidates for question in questions],
         )
         # Items that may not be recommended come last.
         counts = np.isfinite(scores).sum(1).tolist()
@@ -287,16 +288,15 @@ class Served:
         folder: Path,
         shares: Mapping[str, float] | None,
     ) -> None:
-        """
+        """InputError if a run cannot be used, or no run of the folder was promoted.
+
         Args:
             make: loads a run and checks its files.
             shares: name of each arm's run to its share of the users; None for the current run.
-
-        Raises:
-            InputError: a run cannot be used, or no run of the folder was promoted.
         """
         self._make, self._folder = make, folder
-        self._lock, self._closed = threading.Lock(), threading.Event()
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
         self._thread: threading.Thread | None = None
         self._refused: tuple[str, str] | None = None
         self._known: tuple[Promoted, int] | None = None

@@ -60,7 +60,9 @@ class _Connection(H11Protocol):
         **options: Any,
     ):
         super().__init__(*server, **options)
-        self._seconds, self._most, self._of_address = seconds, most, of_address
+        self._seconds = seconds
+        self._most = most
+        self._of_address = of_address
         self._previous: tuple[object, int] | None = None
         self._timer = self.loop.call_later(seconds, self._check)
 
@@ -216,7 +218,8 @@ class Parent:
             with self._lock:
                 if self._server is None:
                     os._exit(0)
-                self._server.should_exit, self._server.force_exit = True, force
+                self._server.should_exit = True
+                self._server.force_exit = force
 
 
 Work = Callable[[socket.socket, Parent], None]

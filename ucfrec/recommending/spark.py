@@ -39,7 +39,7 @@ def recommend_with_spark(
     **how: Any,
 ) -> int:
     """Write the `k` best next items of every user of logs, as `recommend` finds them; returns their
-    number.
+    number. InputError if an argument or the logs cannot be used, or Spark is missing or fails.
 
     Args:
         files: logs, which every worker sees, as the run folder and `out`.
@@ -50,9 +50,6 @@ def recommend_with_spark(
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
         filter_seen, at, how: as of `recommend`; `how` are `skip_unknown`, `new_session` and `seed`.
-
-    Raises:
-        InputError: an argument or the logs cannot be used, or Spark is missing or fails.
     """
     how |= {"k": k, "rule": rule or trained.rule, "filter_seen": filter_seen, "at": at}
     recommended: Any = partial(decide, **how)

@@ -51,7 +51,7 @@ def fitted(binary: bool, folder: Path) -> tuple[ItemRewardModel, EpisodeStore]:
     return model, validation
 
 
-@pytest.mark.parametrize("at_once", [7, 2**16])
+@pytest.mark.parametrize("at_once", [7, 2**17])
 @pytest.mark.parametrize("binary", [True, False])
 def test_sums_are_those_of_a_users_earlier_rows(
     binary: bool, at_once: int, monkeypatch: pytest.MonkeyPatch
@@ -63,7 +63,7 @@ def test_sums_are_those_of_a_users_earlier_rows(
         model.get_buffer(name).uniform_(0.1, 0.9)
     model.binary.fill_(binary)
     users = torch.tensor([0, 3, 9, -1, 140, 5])
-    rows = UserRows.of(view, users, lambda rewards: rewards)
+    rows = UserRows.of(view, lambda rewards: rewards)
     assert rows is not None
     names = "item", "reward", "timestamp"
     items, rewards, times = (torch.from_numpy(view.column(name)) for name in names)

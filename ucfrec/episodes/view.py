@@ -367,10 +367,10 @@ class EpisodeView:
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
-    def step_batches(self) -> Iterator[tuple[IntArray, IntArray]]:
+    def step_batches(self, size: int = _BATCH_STEPS) -> Iterator[tuple[IntArray, IntArray]]:
         """`all_steps` in batches, for views whose steps are too many to list."""
-        for begin in range(0, self.n_steps, _BATCH_STEPS):
-            end = min(begin + _BATCH_STEPS, self.n_steps)
+        for begin in range(0, self.n_steps, size):
+            end = min(begin + size, self.n_steps)
             first, last = np.searchsorted(self._ends, (begin, end - 1), side="right")
             counts = np.diff(self._ends[first : last + 1].clip(max=end), prepend=begin)
             episodes = np.repeat(np.arange(first, last + 1), counts)

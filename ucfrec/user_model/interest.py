@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import IntArray
@@ -14,7 +15,7 @@ from ucfrec.episodes.store import EpisodeStore
 
 _PRIOR = 4.0
 """Rows of a variance of 1 that are added to those of a user."""
-_AT_ONCE = 2**16
+_AT_ONCE = 2**17
 """Rows that are summed at once."""
 
 
@@ -63,7 +64,7 @@ class Interests(ShownTastes):
     ) -> None:
         """Add all rows of a view, whose rewards `target` turns into what is predicted."""
         users = torch.from_numpy(view.episode_values(schema.USER)).long()
-        for episodes, steps in view.step_batches():
+        for episodes, steps in view.step_batches(_AT_ONCE):
             items, rewards, times = (
                 torch.from_numpy(view.step_values(name, episodes, steps))
                 for name in (schema.ITEM, schema.REWARD, schema.TIMESTAMP)
@@ -113,42 +114,18 @@ class Interests(ShownTastes):
 
 @dataclass(frozen=True)
 class UserRows:
-    """The rows of users of a store of items, by user and time."""
+    """The rows of users of a store of items, which are read batch by batch."""
 
-    keys: IntArray
-    """(N,) ascending: the user's number times (1 + T), plus the number of the time."""
-    items: Tensor
-    targets: Tensor
-    """(N,) int64 and float32, as of `Interests.sum_rows`."""
-    times: IntArray
-    """(T,) the distinct times, ascending, int64 ms: their numbers do not overflow in keys."""
+    view: EpisodeStore
+    target: Callable[[Tensor], Tensor]
+    """Turns rewards into what is predicted."""
 
     @classmethod
-    def of(
-        cls,
-        view: EpisodeStore,
-        users: Tensor,
-        target: Callable[[Tensor], Tensor],
-    ) -> "UserRows | None":
-        """The rows of a view that were shown to `users`, but for very long sessions; `target` turns
-        their rewards into what is predicted. None if the view names no users or times."""
+    def of(cls, view: EpisodeStore, target: Callable[[Tensor], Tensor]) -> "UserRows | None":
+        """The rows of a view but for very long sessions; None if it names no users or times."""
         if not view.has_users or schema.TIMESTAMP not in view.record.columns:
             return None
-        view = view.without_long_sessions()
-        owners = view.episode_values(schema.USER).astype(np.int64)
-        followed = np.flatnonzero(np.isin(owners, users[users >= 0].numpy()))
-        view = view.select(followed)
-        owners = owners[followed][view.all_steps()[0]]
-        names = schema.TIMESTAMP, schema.ITEM, schema.REWARD
-        logged, items, rewards = (view.column(name) for name in names)
-        times, numbers = np.unique(logged, return_inverse=True)
-        keys = owners * (1 + len(times)) + numbers
-        order = np.argsort(keys, kind="stable")
-        order = order[items[order] >= 0]
-        if not len(order):
-            return None
-        targets = target(torch.from_numpy(rewards[order]))
-        return cls(keys[order], torch.from_numpy(items[order]).long(), targets, times)
+        return cls(view.without_long_sessions(), target)
 
     def sums_before(
         self,
@@ -157,19 +134,29 @@ class UserRows:
         sum_rows: Callable[[Tensor, Tensor], Tensor],
     ) -> Tensor:
         """Sums (M, D + 2) of the rows of users (M,), −1 for none, before times (M,), int64 ms."""
-        first = users.numpy() * (1 + len(self.times))
-        last = first + np.searchsorted(self.times, times.numpy())
-        places = [np.searchsorted(self.keys, keys) for keys in (first, last)]
-        sums = total = torch.zeros(1, dtype=torch.float64)
-        for start in range(0, len(self.keys), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            rows = sum_rows(self.items[part].unsqueeze(1), self.targets[part].unsqueeze(1))
-            if not start:
-                total = rows.new_zeros(1, rows.shape[1], dtype=torch.float64)
-                sums = total.repeat(len(users), 1)
-            totals = torch.cat([total, total + rows.double().cumsum(0)])
-            for sign, at in zip((-1, 1), places, strict=True):
-                found = np.flatnonzero((at > start) & (at <= start + len(rows)))
-                sums[found] += sign * totals[at[found] - start]
-            total = totals[-1:]
+        asked_users, asked_times = users.numpy(), times.numpy()
+        sums = sum_rows(torch.full((1, 1), -1), torch.zeros(1, 1)).double().repeat(len(users), 1)
+        owners = self.view.episode_values(schema.USER).astype(np.int64)
+        followed = np.flatnonzero(np.isin(owners, asked_users[asked_users >= 0]))
+        view = self.view.select(followed)
+        for episodes, steps in view.step_batches(_AT_ONCE):
+            owner = owners[followed[episodes]]
+            moments, items, rewards = (
+                view.step_values(name, episodes, steps)
+                for name in (schema.TIMESTAMP, schema.ITEM, schema.REWARD)
+            )
+            asked = np.flatnonzero(np.isin(asked_users, owner))
+            # By user and time, what is asked before what was shown at the same time.
+            both = np.concatenate([asked_users[asked], owner])
+            moments = np.concatenate([asked_times[asked], moments])
+            is_row = np.arange(len(both)) >= len(asked)
+            order = np.lexsort((is_row, moments, both))
+            rows = torch.from_numpy(order[is_row[order]] - len(asked))
+            earned = self.target(torch.from_numpy(rewards)[rows]).unsqueeze(1)
+            numbers = torch.from_numpy(items.astype(np.int64))[rows].unsqueeze(1)
+            totals = F.pad(sum_rows(numbers, earned).double().cumsum(0), (0, 0, 1, 0))
+            counts = np.append(0, is_row[order].cumsum())
+            first = np.searchsorted(both[order], asked_users[asked])
+            last = np.argsort(order)[: len(asked)]
+            sums[asked] += totals[counts[last]] - totals[counts[first]]
         return sums.float()

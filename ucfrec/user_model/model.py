@@ -103,8 +103,7 @@ class UserModel:
                 line = users[1].calibration
             else:
                 if users is None and reward.interests.are_known:
-                    shown_to = torch.from_numpy(validation.episode_values(schema.USER))
-                    reward.user_rows = UserRows.of(train.whole, shown_to, reward.target)
+                    reward.user_rows = UserRows.of(train.whole, reward.target)
                 line = calibrate(users[0] if users else reward, validation, _MOST_STEPS, seed)
             fitted: dict[str, Any] = {
                 "calibration": line,

@@ -115,7 +115,7 @@ def fit_item_reward_model(
     set_statistics(model, rows, held_out, train)
     design, new_users = Design.of(model, rows), _are_new(rows, held_out)
     if not new_users:
-        design = _follow_users(model, design, train, rows, held_out)
+        design = _follow_users(model, design, train, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
     if new_users:
@@ -167,7 +167,7 @@ def refit_item_reward_model(
     set_statistics(model, rows, rows, store)
     design = Design.of(model, rows)
     if "interest" in report.kept:
-        design = _follow_users(model, design, store, rows, rows)
+        design = _follow_users(model, design, store, rows)
     begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     if report.new_users:
@@ -295,12 +295,10 @@ def _follow_users(
     design: Design,
     train: EpisodeStore,
     rows: RewardRows,
-    held_out: RewardRows,
 ) -> Design:
     """The design of `rows` with the interests of users, if these are named; sets what items usually
     get, and what users were shown at every time and at the end of training."""
-    users = torch.cat([rows.users, held_out.users])
-    model.user_rows = UserRows.of(train.whole, users, model.target)
+    model.user_rows = UserRows.of(train.whole, model.target)
     if model.user_rows is None:
         return design
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))

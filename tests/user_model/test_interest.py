@@ -13,7 +13,7 @@ from ucfrec.acting.scorer import Scorer, sessions_before
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.user_model.interest import UserRows
+from ucfrec.user_model.interest import find_user_rows
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_report import RewardRows, score_rows
@@ -63,13 +63,12 @@ def test_sums_are_those_of_a_users_earlier_rows(
         model.get_buffer(name).uniform_(0.1, 0.9)
     model.binary.fill_(binary)
     users = torch.tensor([0, 3, 9, -1, 140, 5])
-    rows = UserRows.of(view, lambda rewards: rewards)
-    assert rows is not None
+    assert find_user_rows(view) is not None
     names = "item", "reward", "timestamp"
     items, rewards, times = (torch.from_numpy(view.column(name)) for name in names)
     of_row = torch.arange(40 * STEPS) // (SESSIONS * STEPS)
     moments = times[[0, 40, 3, 9, 50, -1]] + 1
-    found = rows.sums_before(users, moments, model.sum_rows)
+    found = module.sum_before(view, users, moments, lambda rewards: rewards, model.sum_rows)
     for user, moment, sums in zip(users, moments, found, strict=True):
         some = (of_row == user) & (times < moment)
         usual = model.interests.usual[items[some].long()]

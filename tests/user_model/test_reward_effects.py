@@ -31,7 +31,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         rows=torch.from_numpy(vectors[shown]).float(),
         tags=torch.arange(items)[:, None].add(torch.tensor([0, 2])).remainder(5),
         n_tags=4,
-        n_users=users,
+        fitted_users=torch.arange(users),
         binary=binary,
         weights=torch.ones(rows),
         running=torch.from_numpy(rng.normal(size=(rows, 2))).float(),
@@ -44,7 +44,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
 
 def matrix(given: Design, name: str) -> sparse.csr_matrix:
     """What every number of an effect multiplies, row by row."""
-    users = torch.nn.functional.one_hot(given.users, given.n_users + 1).float()
+    users = torch.nn.functional.one_hot(given.users, len(given.fitted_users) + 1).float()
     tags = torch.stack([(given.tags == tag).sum(1) for tag in range(given.n_tags)], 1)
 
     def times_vectors(left: Tensor) -> Tensor:

@@ -137,7 +137,8 @@ class PolicyActor:
             self._actions[rows] = self._scorer.act(sessions)
             return self._actions.numpy(), None
         excluded, excluded_in_rows = self._find_excluded(), None
-        chances, self._actions = torch.ones(len(live)), torch.zeros_like(self._sessions.steps)
+        chances = torch.ones(len(live))
+        self._actions = torch.zeros_like(self._sessions.steps)
         if excluded is not None:
             # The environment steps rows that are not live too, so they also need an allowed action.
             self._actions, excluded_in_rows = (~excluded).int().argmax(1), excluded[rows]

@@ -225,7 +225,9 @@ class _Batcher:
 
     async def _answer_http(self, http: HTTPRequest) -> tuple[int, dict[str, Any]]:
         """HTTP status and JSON of the answer."""
-        seconds, limits, arrived = self._limits.timeout, self._responder.limits, False
+        seconds = self._limits.timeout
+        limits = self._responder.limits
+        arrived = False
         try:
             async with asyncio.timeout(seconds):
                 body = await _read_body(http, limits.bytes)

@@ -1,7 +1,6 @@
 """Interests of users: what they rewarded more than others do, until a decision."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -93,13 +92,9 @@ class Interests(ShownTastes):
         vectors: Tensor,
         binary: Tensor,
     ) -> Tensor:
-        """Sums (B, D + 2) over the rows of users: of (t − t̄) (1, e), and of v.
-
-        Args:
-            items: (B, N) int64, −1 for none.
-            targets: (B, N) what they earned, from 0 to 1 if `binary`, or standardised.
-            vectors: (n_items, D) of all items.
-        """
+        """Sums (B, D + 2) over the rows of users, of (t − t̄) (1, e), and of v, for items (B, N),
+        −1 for none, with targets (B, N), from 0 to 1 if `binary`, or standardised, and the vectors
+        (n_items, D) of all items."""
         valid, items = items >= 0, items.clamp(min=0)
         usual = self.usual[items]
         unusual = ((targets - usual) * valid).unsqueeze(1)
@@ -112,51 +107,48 @@ class Interests(ShownTastes):
         return sums[:, :-1] / (sums[:, -1:] + _PRIOR)
 
 
-@dataclass(frozen=True)
-class UserRows:
-    """The rows of users of a store of items, which are read batch by batch."""
+def find_user_rows(view: EpisodeStore) -> EpisodeStore | None:
+    """The sessions of a view but for very long ones; None if it names no users or times."""
+    if view.has_users and schema.TIMESTAMP in view.record.columns:
+        return view.without_long_sessions()
+    return None
 
-    view: EpisodeStore
-    target: Callable[[Tensor], Tensor]
-    """Turns rewards into what is predicted."""
 
-    @classmethod
-    def of(cls, view: EpisodeStore, target: Callable[[Tensor], Tensor]) -> "UserRows | None":
-        """The rows of a view but for very long sessions; None if it names no users or times."""
-        if not view.has_users or schema.TIMESTAMP not in view.record.columns:
-            return None
-        return cls(view.without_long_sessions(), target)
-
-    def sums_before(
-        self,
-        users: Tensor,
-        times: Tensor,
-        sum_rows: Callable[[Tensor, Tensor], Tensor],
-    ) -> Tensor:
-        """Sums (M, D + 2) of the rows of users (M,), −1 for none, before times (M,), int64 ms."""
-        asked_users, asked_times = users.numpy(), times.numpy()
-        sums = sum_rows(torch.full((1, 1), -1), torch.zeros(1, 1)).double().repeat(len(users), 1)
-        owners = self.view.episode_values(schema.USER).astype(np.int64)
-        followed = np.flatnonzero(np.isin(owners, asked_users[asked_users >= 0]))
-        view = self.view.select(followed)
-        for episodes, steps in view.step_batches(_AT_ONCE):
-            owner = owners[followed[episodes]]
-            moments, items, rewards = (
-                view.step_values(name, episodes, steps)
-                for name in (schema.TIMESTAMP, schema.ITEM, schema.REWARD)
-            )
-            asked = np.flatnonzero(np.isin(asked_users, owner))
-            # By user and time, what is asked before what was shown at the same time.
-            both = np.concatenate([asked_users[asked], owner])
-            moments = np.concatenate([asked_times[asked], moments])
-            is_row = np.arange(len(both)) >= len(asked)
-            order = np.lexsort((is_row, moments, both))
-            rows = torch.from_numpy(order[is_row[order]] - len(asked))
-            earned = self.target(torch.from_numpy(rewards)[rows]).unsqueeze(1)
-            numbers = torch.from_numpy(items.astype(np.int64))[rows].unsqueeze(1)
-            totals = F.pad(sum_rows(numbers, earned).double().cumsum(0), (0, 0, 1, 0))
-            counts = np.append(0, is_row[order].cumsum())
-            first = np.searchsorted(both[order], asked_users[asked])
-            last = np.argsort(order)[: len(asked)]
-            sums[asked] += totals[counts[last]] - totals[counts[first]]
-        return sums.float()
+def sum_before(
+    view: EpisodeStore,
+    users: Tensor,
+    times: Tensor,
+    target: Callable[[Tensor], Tensor],
+    sum_rows: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """Sums (M, D + 2) of the rows of users (M,), −1 for none, before times (M,), int64 ms; `target`
+    turns the rewards of the view into what is predicted."""
+    asked_users = users.numpy()
+    asked_times = times.numpy()
+    nothing = sum_rows(torch.full((1, 1), -1), torch.zeros(1, 1))
+    sums = nothing.double().repeat(len(users), 1)
+    owners = view.episode_values(schema.USER).astype(np.int64)
+    followed = np.flatnonzero(np.isin(owners, asked_users[asked_users >= 0]))
+    view = view.select(followed)
+    for episodes, steps in view.step_batches(_AT_ONCE):
+        owner = owners[followed[episodes]]
+        moments, items, rewards = (
+            view.step_values(name, episodes, steps)
+            for name in (schema.TIMESTAMP, schema.ITEM, schema.REWARD)
+        )
+        queries = np.flatnonzero(np.isin(asked_users, owner))
+        # By user and time, what is asked before what was shown at the same time.
+        both = np.concatenate([asked_users[queries], owner])
+        moments = np.concatenate([asked_times[queries], moments])
+        is_row = np.arange(len(both)) >= len(queries)
+        order = np.lexsort((is_row, moments, both))
+        rows = order[is_row[order]] - len(queries)
+        earned = target(torch.from_numpy(rewards[rows]))
+        numbers = torch.from_numpy(items[rows].astype(np.int64))
+        totals = sum_rows(numbers.unsqueeze(1), earned.unsqueeze(1))
+        totals = F.pad(totals.double().cumsum(0), (0, 0, 1, 0))
+        counts = np.append(0, is_row[order].cumsum())
+        first = np.searchsorted(both[order], asked_users[queries])
+        last = np.argsort(order)[: len(queries)]
+        sums[queries] += totals[counts[last]] - totals[counts[first]]
+    return sums.float()

@@ -17,7 +17,7 @@ from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
-from ucfrec.user_model.interest import UserRows
+from ucfrec.user_model.interest import find_user_rows
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import (
     TrainingUsersReport,
@@ -72,10 +72,8 @@ class UserModel:
         first: Path | None = None,
     ) -> "UserModel":
         """Fit the parts that are not in `folder` yet; read the others. Searches begin near the user
-        model of an earlier state of the store, in the folder `first`.
-
-        Raises:
-            InputError: training rewards are equal, no steps are held out, or a file is damaged.
+        model of an earlier state of the store, in the folder `first`. InputError if training
+        rewards are equal, no steps are held out, or a file is damaged.
         """
         require_blas_memory()
         reward, report = fit_item_reward_model(train, validation, folder, seed, first)
@@ -103,7 +101,7 @@ class UserModel:
                 line = users[1].calibration
             else:
                 if users is None and reward.interests.are_known:
-                    reward.user_rows = UserRows.of(train.whole, reward.target)
+                    reward.user_rows = find_user_rows(train.whole)
                 line = calibrate(users[0] if users else reward, validation, _MOST_STEPS, seed)
             fitted: dict[str, Any] = {
                 "calibration": line,

@@ -9,8 +9,9 @@ from torch.nn import functional as F
 
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.offers import Offer
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.interest import Interests, ShownTastes, UserRows
+from ucfrec.user_model.interest import Interests, ShownTastes, sum_before
 from ucfrec.user_model.running import AGES, RunningRates, TimeBins
 
 MEMORY = 50
@@ -53,13 +54,9 @@ class UserPosterior(ShownTastes):
         vectors: Tensor,
         targets: Tensor,
     ) -> Tensor:
-        """Posterior means (B, D + 1) of level and affinity, times `weights`.
-
-        Args:
-            items: (B, N) int64 items shown, in any order; −1 for none.
-            vectors: (n_items, D) of all items.
-            targets: (B, N) what they earned, as `ItemRewardModel.target`.
-        """
+        """Posterior means (B, D + 1) of level and affinity, times `weights`, from the items (B, N)
+        that were shown, in any order, −1 for none, the vectors (n_items, D) of all items, and what
+        those shown earned (B, N), as `ItemRewardModel.target`."""
         valid, items = items >= 0, items.clamp(min=0)
         inputs = F.pad(vectors[items], (1, 0), value=1.0) @ self.root * valid.unsqueeze(2)
         unusual = (targets - self.usual[items]) * valid
@@ -163,7 +160,7 @@ class ItemRewardModel(nn.Module):
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
         self.interests = Interests(sizes.get("followed", users), items, dim)
-        self.user_rows: UserRows | None = None
+        self.user_rows: EpisodeStore | None = None
         """Of a store, until every decision; None for those of training and the session."""
 
     @property
@@ -279,7 +276,7 @@ class ItemRewardModel(nn.Module):
     def sums_before(self, users: Tensor, times: Tensor) -> Tensor:
         """(M, D + 2) what interests of users (M,) before times (M,) come from, in `user_rows`."""
         assert self.user_rows is not None
-        return self.user_rows.sums_before(users, times, self.sum_rows)
+        return sum_before(self.user_rows, users, times, self.target, self.sum_rows)
 
     def expect(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""

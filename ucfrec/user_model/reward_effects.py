@@ -63,7 +63,7 @@ class Design:
 
     items: Tensor
     users: Tensor
-    """(M,) int64; the last number is that of unknown users."""
+    """(M,) int64 places in `fitted_users`; its length stands for other users."""
     x: Tensor
     """(M, S) standardised states."""
     exposure: Tensor
@@ -79,7 +79,8 @@ class Design:
     tags: Tensor
     """(n_items, T) int64, padded with `n_tags`."""
     n_tags: int
-    n_users: int
+    fitted_users: Tensor
+    """(U,) int64, ascending: numbers of the users whose effects are fitted."""
     binary: bool
     weights: Tensor
     """(M,) how many rows each row counts for."""
@@ -100,21 +101,24 @@ class Design:
         model: ItemRewardModel,
         rows: RewardRows,
         weights: Tensor | None = None,
+        fitted_users: Tensor | None = None,
     ) -> "Design":
-        """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
-        likeness, last = model.likeness, len(model.user) - 1
+        """The design of `rows`, with the statistics of `model`; by default all count one, and the
+        effects of their users are fitted."""
+        likeness = model.likeness
+        if fitted_users is None:
+            fitted_users = torch.unique(rows.users[rows.users >= 0])
         n_tags = int(likeness.n_tags)
         x, history = model.standardise(rows.states), rows.history.latest(model.lags)
         repeated = (history.items == rows.items.unsqueeze(1)).float()
         alike = compare_to_history(likeness, history.items, rows.items)
         both = torch.cat([repeated, alike], 1)
         liked = model.scale_rewards(history.rewards).repeat(1, 2)
-        is_known = (rows.users >= 0) & (rows.users < last)
         position, above = list_inputs(likeness, rows.above, rows.items)
         none = torch.zeros(len(rows), 0)
         design = cls(
             items=rows.items,
-            users=torch.where(is_known, rows.users, last),
+            users=_find_users(fitted_users, rows.users),
             x=x,
             observed=x[:, x.shape[1] - rows.observations :],
             exposure=torch.cat([both, both * liked], 1),
@@ -123,7 +127,7 @@ class Design:
             rows=model.vectors[rows.items],
             tags=torch.where(likeness.tags < 0, n_tags, likeness.tags),
             n_tags=n_tags,
-            n_users=last,
+            fitted_users=fitted_users,
             binary=bool(model.binary),
             weights=torch.ones(len(rows)) if weights is None else weights,
             running=none
@@ -140,7 +144,7 @@ class Design:
 
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
-        of_items = ("vectors", "tags", "n_tags", "n_users", "binary")
+        of_items = ("vectors", "tags", "n_tags", "fitted_users", "binary")
         names = [part.name for part in dataclasses.fields(self) if part.name not in of_items]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -151,7 +155,7 @@ class Design:
 
     def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
-        return replace(self, users=torch.full_like(self.users, self.n_users))
+        return replace(self, users=torch.full_like(self.users, len(self.fitted_users)))
 
     def zeros(self, name: str) -> Tensor:
         """The effect `name`, all zero, float32."""
@@ -160,9 +164,9 @@ class Design:
             "mean": (),
             "tastes": (),
             "item": (len(self.vectors),),
-            "user": (self.n_users + 1,),
+            "user": (len(self.fitted_users) + 1,),
             "content": (self.n_tags + dim,),
-            "affinity": (self.n_users + 1, dim),
+            "affinity": (len(self.fitted_users) + 1, dim),
             **{shared: self.inputs(shared).shape[1:] for shared in _SHARED},
             "interaction": (state, dim),
             "context": (self.observed.shape[1], dim),
@@ -391,13 +395,14 @@ class Beginning:
                 new = design.zeros(name)
                 if old.dtype != new.dtype or not old.isfinite().all():
                     raise ValueError(f"{name} has other values than finite float32")
-                if new.shape == old.shape:
+                if name in ("user", "affinity") and new.shape[1:] == old.shape[1:]:
+                    # The last row is that of unknown users, and of those who came since.
+                    users = F.pad(design.fitted_users, (0, 1), value=-1)
+                    effects[name] = old[users.clamp(max=len(old) - 1)]
+                elif new.shape == old.shape:
                     effects[name] = old
-                elif name in ("item", "user", "affinity") and new.shape[1:] == old.shape[1:]:
-                    # The last row of effects of users is that of unknown ones.
-                    rows = old if name == "item" else old[:-1]
-                    new[: len(rows)] = rows
-                    effects[name] = new
+                elif name == "item":
+                    effects[name] = F.pad(old, (0, len(new) - len(old)))
         numbers = np.abs(np.subtract.outer([e.spread for e in entries], _SPREADS)).argmin(1)
         pairs = zip(entries, numbers.tolist(), strict=True)
         return cls({entry.effect: number for entry, number in pairs if entry.kept}, effects)
@@ -437,8 +442,9 @@ class EffectSearch:
         return {name: _SPREADS[n] for name, n in self.kept.items() if name not in left_out}
 
     def _find_trained(self) -> Tensor:
-        """(n_users + 1,) bool: users with training rows."""
-        trained = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
+        """(U + 1,) bool: users with training rows."""
+        count = len(self.design.fitted_users) + 1
+        trained = torch.bincount(self.design.users, minlength=count) > 0
         trained[-1] = False
         return trained
 
@@ -453,7 +459,7 @@ class EffectSearch:
 
             # How much users differ, relative to noise, is chosen by the held-out loss.
             self.set_tastes(min(_SCALES, key=loss) * root)
-        no_one = bool((self.design.users == self.design.n_users).all())
+        no_one = bool((self.design.users == len(self.design.fitted_users)).all())
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
         near, strides = _FIRST, _STRIDES.get(name, (2,))
@@ -569,13 +575,29 @@ class EffectSearch:
     ) -> None:
         """Write the model with the effects found, its report, and the effects beside it; `file` is
         complete last."""
-        model.set_effects(self.effects, self.design.sum_content)
+        effects = dict(self.effects)
+        for name in effects.keys() & {"user", "affinity"}:
+            effects[name] = self._expand_users(effects[name], len(model.user))
+        model.set_effects(effects, self.design.sum_content)
         file.parent.mkdir(parents=True, exist_ok=True)
-        save_tensors(place_effects(file), self.effects, {})
+        save_tensors(place_effects(file), effects, {})
         save_tensors(file, model.state_dict(), dataclasses.asdict(report))
+
+    def _expand_users(self, effect: Tensor, count: int) -> Tensor:
+        """An effect of users by their numbers in the store, 0 for those without rows."""
+        table = effect.new_zeros((count, *effect.shape[1:]))
+        table[F.pad(self.design.fitted_users, (0, 1), value=-1)] = effect
+        return table
 
     def _losses(self, effects: Effects) -> Tensor:
         return self.held_out.loss(self.held_out.predictor(effects)).double()
+
+
+def _find_users(fitted_users: Tensor, users: Tensor) -> Tensor:
+    """Places (M,) of users in `fitted_users` (U,), ascending; U for others."""
+    places = torch.searchsorted(fitted_users, users)
+    is_fitted = F.pad(fitted_users, (0, 1), value=-2)[places] == users
+    return torch.where(is_fitted, places, len(fitted_users))
 
 
 def place_effects(file: Path) -> Path:

@@ -22,7 +22,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.processes import progress
-from ucfrec.user_model.interest import UserRows
+from ucfrec.user_model.interest import find_user_rows
 from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import (
     CHEAP,
@@ -88,7 +88,8 @@ def fit_item_reward_model(
     seed: int,
     first: Path | None = None,
 ) -> tuple[ItemRewardModel, ItemRewardReport]:
-    """Fit the model to training rows, or read it from `folder` if it was fitted before.
+    """Fit the model to training rows, or read it from `folder` if it was fitted before. InputError
+    if a view has no steps, or all training rewards are equal.
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
@@ -103,21 +104,21 @@ def fit_item_reward_model(
         seed: of the rows drawn from a view with too many.
         first: folder of the model of an earlier state of the store, near whose spreads the search
             begins and ends; where users are known, on fewer rows.
-
-    Raises:
-        InputError: a view has no steps, or all training rewards are equal.
     """
-    model, file = ItemRewardModel(reward_model_sizes(train)), folder / FITTED
+    model = ItemRewardModel(reward_model_sizes(train))
+    file = folder / FITTED
     if file.exists():
         return model, _read_fit(file, model, ItemRewardReport)
     views = train, validation
     rows, held_out = (RewardRows.of(view, model.lags, _MAX_ROWS, seed) for view in views)
     set_statistics(model, rows, held_out, train)
-    design, new_users = Design.of(model, rows), _are_new(rows, held_out)
+    design = Design.of(model, rows)
+    new_users = _are_new(rows, held_out)
     if not new_users:
         design = _follow_users(model, design, train, rows)
     begin = Beginning.of(first, FITTED, design)
-    search = EffectSearch(design, Design.of(model, held_out), begin)
+    validated = Design.of(model, held_out, fitted_users=design.fitted_users)
+    search = EffectSearch(design, validated, begin)
     if new_users:
         rows, held_out = (RewardRows.of(view, MEMORY, _MAX_ROWS, seed) for view in views)
         search.sessions = model, rows.history, held_out.history
@@ -193,10 +194,13 @@ def fit_training_users(
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
     sizes = {**reward_model_sizes(train), "followed": 0}
-    model, file = ItemRewardModel(sizes), folder / _USERS_FITTED
+    model = ItemRewardModel(sizes)
+    file = folder / _USERS_FITTED
     if file.exists():
         return model, _read_fit(file, model, TrainingUsersReport)
-    sessions, states, weights = draw_sessions(train, seed), train.item_states, None
+    sessions = draw_sessions(train, seed)
+    states = train.item_states
+    weights = None
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
     set_statistics(model, rows, rows, train)
@@ -298,7 +302,7 @@ def _follow_users(
 ) -> Design:
     """The design of `rows` with the interests of users, if these are named; sets what items usually
     get, and what users were shown at every time and at the end of training."""
-    model.user_rows = UserRows.of(train.whole, model.target)
+    model.user_rows = find_user_rows(train.whole)
     if model.user_rows is None:
         return design
     effects = fit_effects(design, design.mean_effect(), dict.fromkeys(("item", "user"), _SPREAD))

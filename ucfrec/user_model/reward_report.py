@@ -229,7 +229,8 @@ def fit_line(
     if it is `binary`, otherwise by least squares."""
     from sklearn.linear_model import LinearRegression, LogisticRegression
 
-    inputs, outcomes = scores.double().numpy().reshape(-1, 1), target.double().numpy()
+    inputs = scores.double().numpy().reshape(-1, 1)
+    outcomes = target.double().numpy()
     counts = None if weights is None else weights.double().numpy()
     if binary and 0 < outcomes.mean() < 1:
         model = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0, counts)

@@ -267,13 +267,18 @@ class RuleSearch:
         return results
 
     def _add_evidence(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The rules with evidence: of many sessions where it decides, and no lookahead is slow."""
+        """The rules with evidence: of many sessions where it decides, and no lookahead is slow; of
+        few sessions, effective users count as if there were as many."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
         fast = [item for item in candidates if item not in slow]
         results = list[SimulatedRule]()
         for logged, part in ((self._many, fast), (self._few, slow)):
+            times = self._many.n_users / max(logged.n_users, 1)
             evidence = logged.evaluate([item.rule for item in part]) if part else []
-            results += map(lambda item, of_it: replace(item, evidence=of_it), part, evidence)
+            for item, of_item in zip(part, evidence, strict=True):
+                if of_item.effective_users is not None:
+                    of_item = replace(of_item, effective_users=times * of_item.effective_users)
+                results.append(replace(item, evidence=of_item))
         return results
 
     def _roll_out(

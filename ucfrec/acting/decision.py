@@ -158,18 +158,21 @@ class DecisionRule:
         if earlier is None or not earlier.shape[1]:
             first, *second = (logs.add_(math.log(share)) for share, logs in modes)
             return torch.logaddexp(first, second[0]) if second else first
-        positions, totals = torch.where(earlier < 0, scores.shape[1], earlier), []
+        positions = torch.where(earlier < 0, scores.shape[1], earlier)
+        so_far, never, next_items = list[Tensor](), list[Tensor](), list[Tensor]()
         for share, logs in self._follow_best(modes, scores):
             # A further item that is never drawn stands for none.
             logs = F.pad(logs, (0, 1), value=-torch.inf)
-            chance_so_far = _conditional(logs, positions).masked_fill(earlier < 0, 0.0).sum(1)
+            chances = _conditional(logs, positions).masked_fill(earlier < 0, 0.0)
             left = logs.scatter(1, positions, -torch.inf)[:, :-1].log_softmax(1)
-            totals.append(
-                math.log(share)
-                + chance_so_far.unsqueeze(1)
-                + torch.nan_to_num(left, nan=-torch.inf)
-            )
-        joint = torch.stack(totals).logsumexp(0)
+            next_items.append(torch.nan_to_num(left, nan=-torch.inf))
+            # Beside the chances of items that are never drawn, others would be rounded away.
+            is_drawn = chances > _LAST / 2
+            so_far.append(math.log(share) + chances.where(is_drawn, 0.0).sum(1, keepdim=True))
+            never.append(chances.where(~is_drawn, 0.0).sum(1, keepdim=True))
+        unlikely = torch.stack(never) < torch.stack(never).amax(0)
+        shares = torch.stack(so_far).masked_fill(unlikely, -torch.inf).log_softmax(0)
+        joint = (shares + torch.stack(next_items)).logsumexp(0)
         return torch.nan_to_num(joint - joint.logsumexp(1, keepdim=True), nan=-torch.inf).float()
 
     def _follow_best(

@@ -20,17 +20,10 @@ class Actor(Protocol):
         """Start a new episode in each of `rows`, (M,) environment indices from 0 to N − 1."""
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
-        """Choose one action per environment.
-
-        Args:
-            observations: (N, O).
-            live: (N,) true where the action is used; actions of the other rows are ignored.
-
-        Returns:
-            The actions, (N, A) float32 vectors or (N,) int64 items, and their propensities (N,):
-            the probability of each item, or the probability density of each vector, which may
-            exceed 1. Propensities are None if they are unknown or undefined.
-        """
+        """Choose one action per environment from observations (N, O); those of rows that are not
+        `live` (N,) are ignored. Returns (N, A) float32 vectors or (N,) int64 items, and their
+        propensities (N,): the probability of each item, or the density of each vector, which may
+        exceed 1; None if they are unknown or undefined."""
 
     def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Record the actions just taken, (N, A) or (N,), and their rewards (N,)."""
@@ -79,7 +72,8 @@ class Uniform(Memoryless):
             vectors = self._generator.uniform(low, high, size=(len(observations), *low.shape))
             return vectors.astype(np.float32), None
         assert isinstance(self._space, spaces.Discrete)
-        n_items, forbidden = int(self._space.n), self._forbidden
+        n_items = int(self._space.n)
+        forbidden = self._forbidden
         if forbidden is None:
             chosen = self._generator.integers(n_items, size=len(observations))
             return chosen, np.full(len(observations), 1.0 / n_items, dtype=np.float32)
@@ -185,7 +179,8 @@ def rollout(
             bar.update(int((ended & live).sum()))
             episode = np.where(ended, episode + n, episode)
             live = episode < episodes
-            observations, info = next_observations, next_info
+            observations = next_observations
+            info = next_info
     return Episodes(returns, lengths)
 
 
@@ -193,6 +188,7 @@ def _undo_reset(next_observations: Float32Array, info: Mapping[str, Any]) -> Flo
     """Observations (N, O) after a step; of episodes that ended, the final one, not the reset's."""
     if "final_obs" not in info:
         return next_observations
-    final_observations, ended = next_observations.copy(), np.asarray(info["_final_obs"])
+    final_observations = next_observations.copy()
+    ended = np.asarray(info["_final_obs"])
     final_observations[ended] = np.stack(info["final_obs"][ended])
     return final_observations

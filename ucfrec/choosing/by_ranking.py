@@ -200,11 +200,8 @@ class LoggedOutcomes(NamedTuple):
 
 
 def choose_by_ranking(problem: Problem) -> RuleChoice:
-    """Choose the reward weight of the rule; its other parts stay.
-
-    See `LoggedOutcomes.choose`. If the next larger candidate overlaps too little, weights between
-    the two are tried.
-    """
+    """Choose the reward weight of the rule, as `LoggedOutcomes.choose`; its other parts stay. If
+    the next larger candidate overlaps too little, weights between the two are tried."""
     train, validation, scorer = problem.train, problem.validation, problem.scorer
     n_items = len(train.item_states.embeddings)
     most, n_shown = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS)), min(SHOWN, n_items)

@@ -149,10 +149,8 @@ def normalise_by_step(
     """(S,) estimate plus influence (the derivative by a session's share) of each session.
 
     The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it
-    over sessions. In the bootstrap its influences stand for it: one number a session.
-
-    Args:
-        left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
+    over sessions. In the bootstrap its influences stand for it: one number a session. `left` (N,)
+    is the reward, or what a model leaves of it, whose values `v` (N,) then are.
     """
     weights, step = steps.weights, steps.step
     sessions, totals = len(steps.first), np.bincount(step, weights)
@@ -209,7 +207,8 @@ def cluster_intervals(
     cluster: IntArray | None,
     seed: int,
 ) -> list[Interval | None]:
-    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below.
+    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below, one per column; None
+    where more than a tenth of the resamples have no spread.
 
     Clusters are drawn with replacement, each with all its sessions (Cameron, Gelbach & Miller,
     Review of Economics and Statistics 2008), and every resample's deviation is divided by its own
@@ -219,9 +218,6 @@ def cluster_intervals(
     Args:
         above: (S, K), one row per session, one column per estimate; as `below`.
         cluster: (S,) of each session, any integers; None where each session is its own.
-
-    Returns:
-        One per column; None where more than a tenth of the resamples have no spread.
     """
     resamples = resample(above, below, cluster, seed)
     intervals: list[Interval | None] = []

@@ -199,7 +199,7 @@ def evaluate_off_policy(
         declared=declared,
         models=models,
         traffic=Traffic(
-            days=float(np.ptp(times)) / DAY_MS,
+            days=float(np.ceil(np.ptp(times) / DAY_MS)),
             users=len(np.unique(steps.users)),
             steps=len(steps.reward),
             draws=concentration * n_items,
@@ -255,6 +255,10 @@ def _make_report(
             f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
             "propensity: estimates that weigh leave these sessions out"
         )
+    if schema.EXCLUDES_SEEN not in logs.logged.store.record.columns and not rule.exclude_seen:
+        logs.remarks.append(
+            "seen items may be shown again; serve and recommend leave them out, unless --keep-seen"
+        )
     warnings = [*verdict.reasons, *logs.remarks]
     judged = logs.columns | diagnosis.list_columns() | verdict.list_columns()
     judged["warnings"] = warnings
@@ -308,7 +312,8 @@ def _conclude_lists(
     Independent positions never decide: given the items above it, the ratio of a position leaves out
     how those change what is left to show, so that its interval covers too seldom.
     """
-    steps, results = logs.steps, list[tuple[LoggedSteps, Diagnosis, Verdict]]()
+    steps = logs.steps
+    results = list[tuple[LoggedSteps, Diagnosis, Verdict]]()
     ways = [steps]
     if steps.place is not None:
         ways = [merge_lists(steps), steps, replace(steps, positions="independent")]
@@ -469,7 +474,8 @@ def collect_steps(
     columns: dict[str, Any] = {}
     declared, unknown = "", int(np.isnan(propensity).sum())
     if options.estimate_propensities and unknown:
-        group, owner = np.maximum(groups.number, 0), plain.users[plain.session]
+        group = np.maximum(groups.number, 0)
+        owner = plain.users[plain.session]
         behavior = fit_behavior(inputs.states, items, group, owner, seed)
         declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
         columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)

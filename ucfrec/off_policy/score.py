@@ -96,7 +96,8 @@ def read_logged_sessions(
     by: str | None = None,
 ) -> Iterator[LoggedSessions]:
     """Read logs in the same way as the training logs of a run; they are on disk until the block of
-    this context manager ends.
+    this context manager ends. InputError if the policy's actions are vectors, the logs cannot be
+    used, none of their items is known, or their observations are not those of the training logs.
 
     Args:
         mapping: which columns mean what; what it leaves open is as in the training logs.
@@ -104,10 +105,6 @@ def read_logged_sessions(
             and counted in the report.
         measures: expressions over the columns of the logs to read, too.
         by: column to group users or items by.
-
-    Raises:
-        InputError: the policy's actions are vectors, the logs cannot be used, none of their items
-            is known, or their observations are not those of the training logs.
     """
     require_items(trained)
     record, mapping = trained.record, columns_used(trained, mapping)

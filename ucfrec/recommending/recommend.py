@@ -82,9 +82,8 @@ def decide(
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
     rewards that the session has had lower the target as in acting; with `new_session`, items are
-    scored at the first step of a new one. A rule with a temperature
-    draws the items one after the other, without repetition; otherwise they are the `k` best. For
-    users who are not in the training logs, the state is made of their rows alone.
+    scored at the first step of a new one. A rule with a temperature draws the items one after the
+    other; otherwise they are the `k` best. Of unknown users, the rows alone make the state.
 
     Args:
         batches: the users' histories.
@@ -415,7 +414,8 @@ class ItemIndex:
                 f"policies of kind {kind!r} score items in a way of their own under this rule; "
                 "leave --approximate out"
             )
-        self._scorer, self._rng = scorer, np.random.default_rng(0)
+        self._scorer = scorer
+        self._rng = np.random.default_rng(0)
         vectors = scorer.vectors()
         size = vectors.shape[1]
         lists = max(1, round(len(vectors) ** 0.5)) if len(vectors) >= _FEWEST else 1

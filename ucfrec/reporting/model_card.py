@@ -96,7 +96,9 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
 def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
     """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
     rows = {row.method: row for row in report.rows}
-    row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
+    verdict, row = report.verdict, rows[LOGGED]
+    if verdict.lift.is_reliable and verdict.estimator is not None:
+        row = rows.get(verdict.estimator, row)
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
     files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_format_rule(row)}"
@@ -104,8 +106,8 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
     values = _select_values(row, names) | {"logged": rows[LOGGED].value}
-    warnings = [text for text in report.warnings if text not in report.verdict.reasons]
-    add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *warnings])
+    warnings = [text for text in report.warnings if text not in verdict.reasons]
+    add_measurement(run, "ucfrec ope", of, values, [str(verdict), *warnings])
 
 
 def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:

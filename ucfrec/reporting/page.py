@@ -142,7 +142,8 @@ def _list_warnings(run: _Run) -> list[str]:
 
 def _fill_section(runs: Sequence[_Run], features: Features) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
-    names, record = [run.name for run in runs], runs[0].record
+    names = [run.name for run in runs]
+    record = runs[0].record
     user_models, samples = [], []
     augmented = {run.name: run.augmentation for run in runs if run.augmentation is not None}
     for run in runs:
@@ -174,7 +175,8 @@ def _fill_section(runs: Sequence[_Run], features: Features) -> dict[str, Any]:
 def _summarise(runs: Sequence[_Run]) -> Table:
     columns = {}
     for run in runs:
-        fit, losses = run.record.policy, run.record.reference_losses or {}
+        fit = run.record.policy
+        losses = run.record.reference_losses or {}
         columns[run.name] = {
             "policy": run.record.name,
             "seed": str(run.record.seed),

@@ -205,11 +205,7 @@ def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
 
 def append_rows(path: Path, rows: Sequence[ResultRow]) -> None:
     """Append rows to a file; after an interruption either all are in it or none. Other processes
-    that append to the file wait.
-
-    Raises:
-        ValueError: a row has a number that is not finite.
-    """
+    that append to the file wait. ValueError if a row has a number that is not finite."""
     with atomic.claim(path, wait=True):
         _write(path, _read_text(path), rows)
 

@@ -123,11 +123,9 @@ class LoggedRuns:
 
 
 def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
-    """The fatigue that training rows show most clearly; None if there is none.
-
-    The factor is the share of likes with fatigued users relative to that in the rest of the same
-    sessions: of policies that knew of the fatigue, too little. It is at most a half, held out too.
-    """
+    """The fatigue that training rows show most clearly; None if there is none. The factor is the
+    share of likes with fatigued users relative to that in the rest of the same sessions: of
+    policies that knew of the fatigue, too little. It is at most a half, held out too."""
     best, clearest, remembered = None, 0.0, training.runs.shape[1]
     for length in range(2, min(LONGEST, remembered) + 1):
         for steps in range(1, min(LONGEST, remembered - length + 1) + 1):
@@ -137,7 +135,8 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
             # Twice the logarithm of the likelihood ratio of two Poisson rates.
             clearness = 2 * (likes * np.log(max(likes, 1e-9) / expected) + expected - likes)
             if clearness > clearest:
-                best, clearest = Fatigue(length, steps, likes / expected), clearness
+                best = Fatigue(length, steps, likes / expected)
+                clearest = clearness
     if best is None:
         return None
     likes, expected = held_out.count_likes(best)

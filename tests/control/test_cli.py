@@ -32,10 +32,13 @@ def test_seeds_that_are_none_are_refused() -> None:
         ("train nowhere --out run", "nowhere is not an episode store"),
         ("train store --out run --policy popular", "invalid choice: 'popular'"),
         ("train {store} --out {run} --policy dt --screen drop", "without --screen"),
+        ("train {store} --out run --env Hopper-v5", "--env is for --select-by-return"),
+        ("train {store} --out run --select-by-return 1 --env No-v1", "No-v1 cannot be made"),
         ("evaluate nowhere", "nowhere is not a run folder"),
         ("evaluate run --target abc", "abc is no target; give a number"),
         ("evaluate {run} --env Nope-v1", "Nope-v1 cannot be made"),
         ("evaluate {run} --env Walker2d-v5", "sizes (17, 6)"),
+        ("evaluate {run} --episodes 1", "of Hopper-v5 has not ended after 3 steps"),
         ("evaluate {run} --episodes 0", "--episodes: 0 is not"),
         ("collect --env Hopper-v5 --out out --agent a.zip --noise nan", "give at least 0"),
         ("collect --env Nowhere-v0 --out out --agent a.zip", "Nowhere-v0 cannot be made"),
@@ -53,6 +56,7 @@ def test_what_cannot_be_used_is_refused(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, says: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ucfrec_control.environments.environments._LONGEST", 3)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     paths = {"{run}": folder / "store-run", "{store}": folder / "store"}
     given = [str(paths.get(word, word)) for word in command.split()]

@@ -30,14 +30,23 @@ class Ope(Table):
         result = estimate(trained, rule, EpisodeStore.open(self.store), self.discount)
         for reason in result.reasons:
             print(f"do not rely on the estimate: {reason}")
-        value = "no estimate" if result.value is None else f"{result.value:.4g}"
+        value, of_behaviour = (
+            "no estimate" if estimated is None else f"{estimated:.4g}"
+            for estimated in (result.value, result.behaviour_value)
+        )
         if result.interval is not None:
             low, high = result.interval
             value += f" [{low:.4g}, {high:.4g}]"
         print(f"discounted returns of an episode, γ = {self.discount:g}")
         print(f"policy        {value}, by fitted Q evaluation")
+        print(f"behaviour     {of_behaviour}, by fitted Q evaluation")
         print(f"behaviour     {result.behaviour:.4g}, logged")
         print(f"best quarter  {result.best_quarter:.4g}, logged")
+        if result.cut:
+            print(
+                f"A time limit ended {result.cut:,} trajectories: their logged returns stop there, "
+                "estimates go on."
+            )
         print(
             "\nThe interval is over trajectories. It does not cover what the regressions cannot "
             "express: try the policy in a simulator before it moves a robot."

@@ -7,9 +7,10 @@ import torch
 from ucfrec.commands.options import POSITIVE, Names
 from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
 from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.environments.environments import environment_of_data
+from ucfrec_control.environments.environments import environment_of_data, make_env
 from ucfrec_control.training.screening import read_screening
 from ucfrec_control.training.selection import select_by_return
 from ucfrec_control.training.train import (
@@ -32,9 +33,13 @@ class Train(TrainingOptions):
     select_by_return: Annotated[int | None, POSITIVE, "EPISODES"] = None
     """Also keep the weights with the highest return in so many episodes at every validation, as
     checkpoint return (paper, Appendix G.3)"""
+    env: str | None = None
+    """Environment of --select-by-return (default: that of the data)"""
 
     def execute(self) -> None:
-        """Run `ucfrec-control train`."""
+        """Run `ucfrec-control train`. InputError if --env is given alone, or cannot be made."""
+        if self.env is not None and self.select_by_return is None:
+            raise InputError("--env is for --select-by-return; leave it out, or give both")
         if self.threads is not None:
             torch.set_num_threads(self.threads)
         store = EpisodeStore.open(self.store)
@@ -42,7 +47,8 @@ class Train(TrainingOptions):
         config = resolve_config(self.policy, self.config, self.set, self.seed, preset.tables)
         callbacks = SILENT
         if self.select_by_return is not None:
-            env_id = environment_of_data(dataset_of(store))
+            env_id = self.env or environment_of_data(dataset_of(store))
+            make_env(env_id, 1).close()  # before the training, not at its first validation
             callbacks = select_by_return(self.out, env_id, self.select_by_return)
         record = train_control(store, self.out, config, screening=self.screen, callbacks=callbacks)
         print(record.describe())

@@ -52,6 +52,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         more = [name for name in ("timeouts", "next_observations", _FINAL) if name in file]
         steps |= {name: read_numbers(file, path, name) for name in more}
         recorded = file.attrs.get("env_id")
+    if isinstance(recorded, bytes):
+        recorded = recorded.decode(errors="replace")
     _require_aligned(steps, path)
     environment = env_id or (recorded if isinstance(recorded, str) else None)
     task = find_task(environment or dataset_name(path))

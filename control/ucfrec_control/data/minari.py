@@ -74,7 +74,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     if complete and not is_antmaze(env_id or ""):
         # Of gymnasium-robotics, newer AntMazes have other sizes than D4RL's.
         sizes = (seen_before.shape[1], actions.shape[1])
-        check_sizes(find_task(env_id), sizes, source)
+        check_sizes(find_task(env_id or ""), sizes, source)
     return Trajectories(
         observations=seen_before,
         actions=actions,

@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers import TimeLimit
 
 from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError
@@ -26,6 +27,8 @@ SIDE_BY_SIDE = 50
 _MOST_FRAMES = 1000
 """Largest number of simulated frames a step, which data of others states; MuJoCo's environments:
 5."""
+_LONGEST = 100_000
+"""Largest number of steps of an episode."""
 
 AnyEnv = VectorEnv[Any, Any, Any]
 Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
@@ -71,6 +74,7 @@ def make_env(
         wrappers = [GoalObservations, *wrappers]
     if len(appended):
         wrappers.append(partial(AppendedConstants, constants=appended))
+    wrappers.append(partial(_Ending, max_episode_steps=_LONGEST))
     try:
         with warnings.catch_warnings():
             # D4RL's data needs v4, so the old version is intended.
@@ -88,7 +92,7 @@ def make_env(
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
             f"the environment {env_id} cannot be made ({reason}); install ucfrec[control], or name "
-            "another with --env"
+            "another with --env, your own as MODULE:NAME"
         ) from None
 
 
@@ -99,8 +103,8 @@ def environment_of_data(dataset: Mapping[str, Any]) -> str:
     name, env_id = dataset["dataset"], dataset["env_id"]
     if env_id is None:
         raise InputError(
-            f"the data of {name} does not name its environment; give it with --env of "
-            "`evaluate`, or prepare the data with it"
+            f"the data of {name} does not name its environment; give it with --env, or prepare the "
+            "data with it"
         )
     module, separator, _ = str(env_id).partition(":")
     if separator:
@@ -109,6 +113,11 @@ def environment_of_data(dataset: Mapping[str, Any]) -> str:
             f"{module} would be run; name the environment with --env"
         )
     return str(env_id)
+
+
+def is_of_data(env_id: str, dataset: Mapping[str, Any]) -> bool:
+    """Return whether `env_id` is the environment that a dataset names, in whichever module."""
+    return env_id.rpartition(":")[2] == str(dataset["env_id"]).rpartition(":")[2]
 
 
 class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
@@ -149,6 +158,19 @@ def antmaze_settings(env_id: str) -> Mapping[str, Any]:
     return {} if env_id in _REBUILT else {"continuing_task": False, "reward_type": "sparse"}
 
 
+class _Ending(TimeLimit):
+    """Raises InputError in an episode of `max_episode_steps`, rather than cutting it."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        done = super().step(action)
+        if (self._elapsed_steps or 0) >= _LONGEST:
+            raise InputError(
+                f"an episode of {getattr(self.unwrapped.spec, 'id', self)} has not ended after "
+                f"{_LONGEST:,} steps; register the environment with max_episode_steps"
+            )
+        return done
+
+
 class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
     """Flattens AntMaze's dictionary observations to the vectors (29,) of D4RL's datasets.
 
@@ -175,7 +197,7 @@ class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
     """How the evaluation's environment differs from the one that the data was made in."""
     warnings_ = []
-    if dataset["env_id"] not in (None, env_id):
+    if dataset["env_id"] is not None and not is_of_data(env_id, dataset):
         warnings_.append(f"the data is of {dataset['env_id']}, the evaluation is in {env_id}")
     if env_id in _REBUILT:
         warnings_.append(

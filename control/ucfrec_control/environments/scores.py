@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,7 @@ class Task:
 
     name: str
     pattern: str
-    """Text contained in the names of its environments and datasets, once these are in lower case
-    and without `-`, `_`, `/` and spaces."""
+    """Regular expression, in lower case, of the name that its environments and datasets share."""
     sizes: tuple[int, int]
     """Number of state dimensions and of action dimensions in D4RL's datasets, (S, A)."""
     low: float
@@ -38,7 +37,7 @@ class Task:
 
     def d4rl_env(self, dataset: str) -> str | None:
         """Gymnasium's environment of a D4RL dataset of this name, or None if there is none."""
-        plain = _plain(dataset)
+        plain = re.sub("[-_/]", "", dataset.lower())
         return next((env for name, env in self.d4rl_envs.items() if name in plain), None)
 
 
@@ -52,10 +51,6 @@ def normalise(returns: npt.ArrayLike, reference: tuple[float, float]) -> Float64
     if not low < high:
         raise InputError(f"--reference {low:g} {high:g}: the second return must be the higher one")
     return 100 * (np.asarray(returns, dtype=np.float64) - low) / (high - low)
-
-
-def _plain(name: str) -> str:
-    return re.sub("[-_/ ]", "", name.lower())
 
 
 D4RL_ANTMAZE = "d4rl/antmaze-{maze}-v2"
@@ -72,15 +67,21 @@ TASKS = (
     Task("hopper", "hopper", (11, 3), -20.272305, 3234.3, {"": "Hopper-v4"}),
     Task("halfcheetah", "halfcheetah", (17, 6), -280.178953, 12135.0, {"": "HalfCheetah-v4"}),
     Task("walker2d", "walker2d", (17, 6), 1.629008, 4592.3, {"": "Walker2d-v4"}),
-    Task("antmaze", "antmaze", (29, 8), 0.0, 1.0, _ANTMAZES),
+    Task("antmaze", "ant_?maze", (29, 8), 0.0, 1.0, _ANTMAZES),
 )
 
+_DATA: Final = (
+    "random|medium|mixed|expert|full|simple|((u|big|hardest)-?maze|medium|open|large)(dense)?"
+)
+"""What may follow a task in a name of D4RL, Minari or Gymnasium, apart from a version."""
+_NAME: Final = rf"((d4rl|mujoco)/|gymnasium_robotics:)?%s([-_/](v\d+|({_DATA})([-_/].*)?))?"
 
-def find_task(name: str | None, second_name: str | None = None) -> Task | None:
-    """The task of a name of an environment, file or dataset, else of another name; None if neither
-    belongs to one."""
-    plain = [_plain(text or "") for text in (name, second_name)]
-    return next((task for text in plain for task in TASKS if task.pattern in text), None)
+
+def find_task(name: str) -> Task | None:
+    """The task of an environment, file or dataset; None unless its name is one of D4RL, Minari or
+    Gymnasium, such as `Hopper-v4` and `hopper_medium-zoo`: robots of similar names are others."""
+    plain = name.lower()
+    return next((task for task in TASKS if re.fullmatch(_NAME % task.pattern, plain)), None)
 
 
 # The first match counts. "medium" comes after the longer names that contain it, and after

@@ -22,6 +22,7 @@ from ucfrec_control.environments.environments import (
     AnyEnv,
     Wrap,
     environment_of_data,
+    is_of_data,
     make_env,
     mismatches,
 )
@@ -131,7 +132,7 @@ def open_environment(
         InputError: `env_id` cannot be made, or its sizes are not those of the training.
     """
     record, dataset = trained.record, _dataset(trained)
-    data_settings = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
+    data_settings = dataset.get("env_settings", {}) if is_of_data(env_id, dataset) else {}
     appended = [distractor] * len(dataset.get("distractors", []))
     env = make_env(env_id, count, appended, {**data_settings, **settings}, wrappers)
     observation_size = int(np.prod(env.single_observation_space.shape or ()))
@@ -168,8 +169,8 @@ def rules_of(
     dataset, method = _dataset(trained), trained.record.config.policy_name
     if isinstance(trained, RLPolicy) or not takes_target(trained.record):
         return (None,)
-    name, kind = dataset["dataset"], find_kind(dataset["dataset"])
-    task = find_task(env_id or dataset["env_id"], name)
+    kind = find_kind(dataset["dataset"])
+    task = find_task(env_id or dataset["env_id"] or dataset["dataset"])
     targets = targets or find_preset(task.name if task else "", kind, method).targets
     return [DecisionRule(target) for target in targets] or [trained.rule]
 
@@ -201,7 +202,7 @@ def _row(
     reference: tuple[float, float] | None,
 ) -> ResultRow:
     record, dataset = trained.record, _dataset(trained)
-    task = find_task(env_id, dataset["dataset"])
+    task = find_task(env_id)
     scale = reference or ((task.low, task.high) if task else None)
     began = time.perf_counter()
     rolled_out = play(trained, env_id, rule, episodes, seed, distractor)

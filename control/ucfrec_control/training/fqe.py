@@ -36,16 +36,20 @@ _BIASED: Final = 0.1
 
 @dataclass(frozen=True)
 class Estimate:
-    """The discounted return of an episode, from its first step."""
+    """The discounted return of an episode, from its first step; an estimate has no time limit."""
 
     value: float | None
     """None if the regressions did not settle, as then the interval is."""
     interval: tuple[float, float] | None
     """95%, over trajectories; None of fewer trajectories than groups."""
+    behaviour_value: float | None
+    """Of the logged behaviour by the same method; None if the regressions did not settle."""
     behaviour: float
-    """Mean of the logged trajectories."""
+    """Mean of the logged trajectories, each as long as it was logged."""
     best_quarter: float
-    """Mean of the quarter with the highest returns."""
+    """Mean of the quarter of them with the highest returns."""
+    cut: int
+    """Number of trajectories that a time limit ended."""
     reasons: tuple[str, ...]
     """Not to rely on the value; empty for none."""
 
@@ -76,9 +80,9 @@ def estimate(
 ) -> Estimate:
     """Estimate the discounted return of a policy from trajectories of the same robot.
 
-    Of trajectories that the step limit ended, the last step is not regressed, because the state
-    after it is unknown; the behaviour's return goes on with the estimate there. InputError if
-    `discount` is not in (0, 1), the store is of other sizes, or no trajectory has two steps.
+    Of trajectories that a time limit ended, the last step is not regressed, because the state after
+    it is unknown. InputError if `discount` is not in (0, 1), the store is of other sizes, or no
+    trajectory has two steps.
     """
     if not 0 < discount < 1:
         raise InputError(f"--discount is {discount:g}; give a number between 0 and 1")
@@ -99,12 +103,11 @@ def estimate(
     model, variance = _Model(store, discount), logged.var(axis=0)
     apart = np.square(chosen - logged).mean(axis=0)[variance > 0]
     distance = float((apart / variance[variance > 0]).mean()) if len(apart) else 0.0
-    of_behaviour, of_policy = model.fit(logged), model.fit(chosen)
-    converged, has_few = (
-        of_policy.converged and of_behaviour.converged,
-        len(store.lengths) < _GROUPS,
-    )
-    returns, half, value = model.average_logged(of_behaviour.weights), 0.0, of_policy.value
+    of_behaviour, of_policy = model.fit(logged, to_limit=True), model.fit(chosen)
+    converged = of_policy.converged and of_behaviour.converged
+    has_few = len(store.lengths) < _GROUPS
+    returns, half, value = model.returns, 0.0, of_policy.value
+    later = model.estimate_later(of_behaviour.weights)
     reasons = []
     if not converged:
         reasons.append("the regressions did not settle")
@@ -115,24 +118,28 @@ def estimate(
     if distance > _FAR:
         reasons.append(
             f"the policy's actions are far from the logged ones ({distance:.2g} of their variance, "
-            f"at most {_FAR:g}), so the log does not show what they lead to"
+            f"at most {_FAR:g}), so the value rests on the regressions' model of actions"
         )
-    mean, spread = float(returns.mean()), float(returns.std())
-    allowed = _BIASED * spread + (0.0 if has_few else of_behaviour.half_width)
-    if converged and abs(of_behaviour.value - mean) > allowed:
+    # Compared is what was logged: after a time limit, the estimate would be compared with itself.
+    mean, said = float(returns.mean()), of_behaviour.value
+    allowed = _BIASED * float(returns.std()) + (0.0 if has_few else of_behaviour.half_width)
+    if of_behaviour.converged and abs(said - mean) > allowed:
         reasons.append(
-            f"the same method says {of_behaviour.value:.4g} of the behaviour, which returned "
-            f"{mean:.4g}"
+            f"the same method says {said:.4g} of the logged steps, which returned {mean:.4g}"
         )
-    if converged and not returns.min() <= value <= returns.max():
+    low, high = (returns + later).min(), (returns + later).max()
+    if converged and not low <= value <= high:
+        goes_on = ", continued by the estimate after a time limit" if model.cut.any() else ""
         reasons.append(
-            f"the value is outside of what was logged ({returns.min():.4g} to {returns.max():.4g})"
+            f"the value is outside of the logged returns{goes_on} ({low:.4g} to {high:.4g})"
         )
     return Estimate(
         value=value if converged else None,
         interval=(value - half, value + half) if converged and not has_few else None,
+        behaviour_value=said + float(later.mean()) if of_behaviour.converged else None,
         behaviour=mean,
         best_quarter=float(np.sort(returns)[-max(1, len(returns) // 4) :].mean()),
+        cut=int(model.cut.sum()),
         reasons=tuple(reasons),
     )
 
@@ -161,7 +168,11 @@ class _Model:
         waves = min(_FEATURES, store.n_steps // _STEPS_PER_FEATURE)
         self._slopes = rng.normal(0, size**-0.5, (size, waves))
         self._phases = rng.uniform(0, 2 * np.pi, waves)
-        self._ends, self._cut = self._starts + self._lengths - 1, ~store.terminated.astype(bool)
+        self._ends, self.cut = self._starts + self._lengths - 1, ~store.terminated.astype(bool)
+        steps = np.arange(store.n_steps) - np.repeat(self._starts, self._lengths)
+        self._discounts = discount**steps
+        self.returns = np.add.reduceat(self._discounts * self._rewards, self._starts)
+        """Discounted returns (E,) of the logged trajectories."""
         self._groups = min(_GROUPS, len(self._lengths))
 
     def _features(self, rows: IntArray, actions: Array) -> Float64Array:
@@ -170,9 +181,10 @@ class _Model:
         waves = np.cos(inputs @ self._slopes + self._phases)
         return np.hstack([waves, inputs, np.ones((len(rows), 1))])
 
-    def fit(self, chosen: Array) -> _Fit:
-        """Q of a policy with the actions `chosen` (N, A) at all steps."""
-        sums = [self._sum(group, chosen) for group in range(self._groups)]
+    def fit(self, chosen: Array, to_limit: bool = False) -> _Fit:
+        """Q of a policy with the actions `chosen` (N, A) at all steps; its value ends where a time
+        limit cut the trajectory if `to_limit`."""
+        sums = [self._sum(group, chosen, to_limit) for group in range(self._groups)]
         total = [np.sum(parts, axis=0) for parts in zip(*sums, strict=True)]
         weights, value, converged = self._solve(total)
         if self._groups < _GROUPS:
@@ -186,14 +198,19 @@ class _Model:
         converged = converged and all(ended for *_, ended in without)
         return _Fit(weights, value, float(student.ppf(0.975, _GROUPS - 1) * spread), converged)
 
-    def _sum(self, group: int, chosen: Array) -> tuple[Array, ...]:
-        """Σ φφᵀ, Σ φφ'ᵀ, Σ φr, Σ φ of first steps, and their number, of a group of trajectories."""
+    def _sum(self, group: int, chosen: Array, to_limit: bool) -> tuple[Array, ...]:
+        """Σ φφᵀ, Σ φφ'ᵀ, Σ φr, Σ φ of first steps, Σ of rewards that are no features of theirs, and
+        number, of a group of trajectories."""
         mine = np.arange(len(self._lengths)) % self._groups == group
         is_row = np.repeat(mine, self._lengths)
-        is_row[self._ends[self._cut]] = False
+        is_row[self._ends[self.cut]] = False
         ends, rows = np.zeros(len(is_row), dtype=bool), np.flatnonzero(is_row)
         ends[self._ends] = True
-        first = self._features(self._starts[mine], chosen).sum(0)
+        first, at_limit = self._features(self._starts[mine], chosen).sum(0), self._ends[:0]
+        if to_limit:  # of the last step, the reward counts in place of Q
+            at_limit = self._ends[mine & self.cut]
+            first -= self._discounts[at_limit] @ self._features(at_limit, chosen)
+        known = self._discounts[at_limit] @ self._rewards[at_limit]
         squares, products = np.zeros((2, len(first), len(first)))
         rewards = np.zeros(len(first))
         for part in np.array_split(rows, -(-len(rows) // _BATCH) or 1):
@@ -203,11 +220,11 @@ class _Model:
             squares += now.T @ now
             products += now.T @ later
             rewards += now.T @ self._rewards[part]
-        return squares, products, rewards, first, np.array(mine.sum())
+        return squares, products, rewards, first, np.array([known, mine.sum()])
 
     def _solve(self, sums: list[Array]) -> tuple[Float64Array, float, bool]:
         """Weights, mean value of the first steps, and whether the regressions converged."""
-        squares, products, rewards, first, count = sums
+        squares, products, rewards, first, (known, count) = sums
         ridge = _RIDGE * np.trace(squares) / len(squares) * np.eye(len(squares))
         solved = np.linalg.solve(squares + ridge, np.column_stack([rewards, products]))
         weights, matrix = solved[:, 0], self._discount * solved[:, 1:]
@@ -218,13 +235,9 @@ class _Model:
             converged = bool(np.abs(change).max() <= 1e-6 * np.abs(weights).max())
             if converged or np.abs(change).max() > 1e9 * size:
                 break
-        return weights, float(first @ weights / count), converged
+        return weights, float((first @ weights + known) / count), converged
 
-    def average_logged(self, weights: Float64Array) -> Float64Array:
-        """Discounted returns (E,) of the logged trajectories; where the step limit cut one, its
-        last step counts by Q."""
-        steps = np.arange(len(self._rewards)) - np.repeat(self._starts, self._lengths)
-        rewards = self._rewards.copy()
-        cut = self._ends[self._cut]
-        rewards[cut] = self._features(cut, self._logged) @ weights
-        return np.add.reduceat(rewards * self._discount**steps, self._starts)
+    def estimate_later(self, weights: Float64Array) -> Float64Array:
+        """What Q adds to the logged returns (E,) after a time limit."""
+        later = self._features(self._ends, self._logged) @ weights - self._rewards[self._ends]
+        return np.where(self.cut, self._discounts[self._ends] * later, 0.0)

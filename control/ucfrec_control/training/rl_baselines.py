@@ -150,7 +150,7 @@ def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RL
         algorithm: one of `ALGORITHMS`.
         settings: the other fields of `RLConfig`.
     """
-    task = find_task(dataset["env_id"], dataset["dataset"])
+    task = find_task(dataset["env_id"] or dataset["dataset"])
     kind = find_kind(dataset["dataset"])
     return RLConfig(algorithm=algorithm, task=task.name if task else "", kind=kind, **settings)
 

@@ -92,14 +92,14 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
 
 def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
     """The preset of a method on the dataset that `dataset_of` describes."""
-    task = find_task(dataset["env_id"], dataset["dataset"])
+    task = find_task(dataset["env_id"] or dataset["dataset"])
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 
 
 def describe_returns(store: EpisodeStore) -> str:
     """What the logged trajectories returned, which a policy is compared with: two lines of text."""
     dataset, returns = dataset_of(store), np.sort(store.returns)
-    task = find_task(dataset["env_id"], dataset["dataset"])
+    task = find_task(dataset["env_id"] or dataset["dataset"])
     parts = {"behaviour": returns, "best quarter": returns[-max(1, len(returns) // 4) :]}
     return "\n".join(
         f"{name:13} mean return {values.mean():.4g} of {len(values):,} logged trajectories"

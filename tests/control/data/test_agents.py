@@ -70,8 +70,6 @@ def test_an_agent_acts_as_its_library_lets_it(name: str, tmp_path: Path) -> None
 
 
 class _Trap:
-    """Writes a file when it is unpickled."""
-
     def __init__(self, file: Path) -> None:
         self.file = file
 

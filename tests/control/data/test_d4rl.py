@@ -100,18 +100,28 @@ def test_ends_are_derived_where_timeouts_are_missing(tmp_path: Path) -> None:
 
 
 def test_names_tell_environments_and_kinds(tmp_path: Path) -> None:
-    for name, given, env_id in (
-        ("hopper_medium_expert-v2", None, "Hopper-v4"),
-        ("halfcheetah", "Hopper-v5", "Hopper-v5"),
-        ("mine", None, None),
+    for name, stated, given, env_id in (
+        ("hopper_medium_expert-v2", None, None, "Hopper-v4"),
+        ("halfcheetah", None, "Hopper-v5", "Hopper-v5"),
+        ("walker2d", np.bytes_("Hopper-v5"), None, "Hopper-v5"),
+        ("mine", None, None, None),
     ):
-        file = write_hdf5(tmp_path / f"{name}.hdf5", hopper_like(), env_id=None)
+        file = write_hdf5(tmp_path / f"{name}.hdf5", hopper_like(), env_id=stated)
         assert read_d4rl(file, given).source["env_id"] == env_id
+    file = "Ant_maze_{}-maze_noisy_multistart_True_multigoal_True_sparse_fixed"
+    for maze, *names in (
+        ("umaze", "antmaze-umaze-v2", "antmaze-umaze-diverse-v2", file.format("u")),
+        ("medium", "antmaze-medium-play-v2", file.format("big")),
+        ("large", "antmaze-large-diverse-v2", file.format("hardest")),
+    ):
+        assert {find_task(n).d4rl_env(n) for n in names} == {f"d4rl/antmaze-{maze}-v2"}
+    assert find_task("antmaze").d4rl_env("antmaze-mine") is None
     assert find_kind("hopper_medium_expert-v2") == "medium-expert"
     assert find_kind("mujoco/hopper/medium-v0") == "medium"
     assert find_task("HalfCheetah-v5").score(12135.0) == 100
-    assert find_task(None, "walker2d_mixed-zoo").score([1.629008, 4592.3]).tolist() == [0, 100]
-    assert find_task("Ant-v5") is None
+    assert find_task("walker2d_mixed-zoo").score([1.629008, 4592.3]).tolist() == [0, 100]
+    others = ("Ant-v5", "HopperBot-v0", "grasshopper2", "mine:Hopper-v4", "MyAntMaze-v0")
+    assert {find_task(name) for name in others} == {None}
 
 
 def with_one(value: float) -> Callable[[Array], Array]:
@@ -223,7 +233,6 @@ def test_truncated_files_and_damaged_columns_are_refused(tmp_path: Path) -> None
 
 
 def test_both_formats_make_equal_stores(file: Path, tmp_path: Path, minari_folder: Path) -> None:
-    """HDF5 → Minari → HDF5, each to a store."""
     back, stores = tmp_path / "back.hdf5", []
     control("convert", file, "hopper/mine-v0")
     assert "jax" not in sys.modules  # Minari's own recorder needs it

@@ -109,8 +109,6 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
 
 
 class Teleported(Memoryless):
-    """Stands still until step 3, when every second ant is put on its goal."""
-
     def __init__(self, env: Any) -> None:
         self._env, self._steps = env, 0
 
@@ -187,18 +185,6 @@ def test_mazes_are_of_the_data(run: Path, tmp_path: Path, monkeypatch: pytest.Mo
     # The cell of "r", three rows down at the left, whatever the seed.
     assert np.abs(np.array(starts)[:, :2] - (-4, -4)).max() <= 1
     environment.close()
-
-
-def test_names_of_d4rl_tell_its_environments() -> None:
-    file = "Ant_maze_{}-maze_noisy_multistart_True_multigoal_True_sparse_fixed"
-    for maze, *names in (
-        ("umaze", "antmaze-umaze-v2", "antmaze-umaze-diverse-v2", file.format("u")),
-        ("medium", "antmaze-medium-play-v2", file.format("big")),
-        ("large", "antmaze-large-diverse-v2", file.format("hardest")),
-    ):
-        found = {find_task(name).d4rl_env(name) for name in names}
-        assert found == {f"d4rl/antmaze-{maze}-v2"}
-    assert find_task("antmaze").d4rl_env("antmaze-mine") is None
 
 
 def test_without_robotics_the_extra_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

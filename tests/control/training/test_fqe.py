@@ -31,7 +31,8 @@ def test_a_value_is_within_its_interval_of_the_simulated_one(tmp_path: Path, gai
     source = {"where": "here", "dataset": "line", "env_id": None, "versions": {}}
     logged = rewards.ravel().astype(np.float32)
     Trajectories(*flat, logged, lengths, cut, None, source).write_store(tmp_path / "store")
-    fit = _Model(EpisodeStore.open(tmp_path / "store"), DISCOUNT).fit(-gain * flat[0])
+    model = _Model(EpisodeStore.open(tmp_path / "store"), DISCOUNT)
+    fit = model.fit(-gain * flat[0])
     assert fit.converged
     # All states of a policy count, so the simulated episodes have to last as long as they can.
     later = np.concatenate([simulate(gain, 0.0, 4000, seed)[2] for seed in (1, 2)])
@@ -39,3 +40,8 @@ def test_a_value_is_within_its_interval_of_the_simulated_one(tmp_path: Path, gai
     end = later[:, -1].mean() * DISCOUNT**STEPS / (1 - DISCOUNT)
     assert abs(fit.value - values.mean() - end) < max(2 * fit.half_width, 0.1)
     assert 0 < fit.half_width < 1
+    # Of what was logged, the method says what it returned; what it adds later is no part of it.
+    ending, returns = model.fit(flat[1], to_limit=True), rewards @ DISCOUNT ** np.arange(STEPS)
+    assert ending.value == pytest.approx(returns.mean(), abs=0.1)
+    later = model.estimate_later(ending.weights).mean()
+    assert 0.5 < model.fit(flat[1]).value - ending.value == pytest.approx(later)

@@ -129,10 +129,14 @@ def test_observations_that_do_not_fit_are_refused(folder: Path) -> None:
 
 
 def test_the_return_is_estimated_with_reasons_against_it(folder: Path) -> None:
-    said = control("ope", folder / "run", folder / "store", "--discount", 0.8)[0]
+    said = control("ope", folder / "run", folder / "store", "--discount", 0.9)[0]
     # Torques drawn at random tell nothing of a policy that does not draw them.
     assert "do not rely on the estimate: the policy's actions are far" in said
     assert re.search(r"policy +-\d+.*\[-.*\nbehaviour +-\d+", said)
+    rewards = EpisodeStore.open(folder / "store").column(schema.REWARD).reshape(24, 40)
+    returns = np.sort(rewards @ 0.9 ** np.arange(40))
+    assert f"behaviour     {returns.mean():.4g}, logged\n" in said
+    assert f"best quarter  {returns[-6:].mean():.4g}, logged\nA time limit ended 24 traj" in said
     assert "discount is 1" in refused("ope", folder / "run", folder / "store", "--discount", 1)
 
 

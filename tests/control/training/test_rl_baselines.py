@@ -30,8 +30,6 @@ pytest.importorskip("mujoco", reason="the extra control is not installed")
 
 
 class _Stops:
-    """Progress during whose fifth step the user interrupts."""
-
     seen = 0
 
     def update(self, n: float = 1, **shown: float) -> None:

@@ -32,8 +32,6 @@ from ucfrec_control.training.screening import (
 from ucfrec_control.training.train import make_interventions, train_control
 
 FAST = ScreeningConfig(hidden=48, shared_steps=300, own_steps=100, trees=25)
-
-
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 
 
@@ -140,8 +138,6 @@ FLAGGED = (0, 4)
 
 
 def screen_as(flagged: Sequence[int]) -> Callable[[EpisodeStore, int], ScreeningReport]:
-    """A screening that flags these dimensions."""
-
     def screen(store: EpisodeStore, seed: int) -> ScreeningReport:
         dimensions = (DimensionReport(d, causes=d not in flagged) for d in range(store.state_size))
         return ScreeningReport(tuple(dimensions), 0.5, 100)
@@ -151,7 +147,6 @@ def screen_as(flagged: Sequence[int]) -> Callable[[EpisodeStore, int], Screening
 
 @pytest.fixture
 def _known_verdicts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Screening itself is tested above; here its verdicts are known."""
     monkeypatch.setattr(train, "screen_store", screen_as(FLAGGED))
 
 

@@ -29,7 +29,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.environments.environments import make_env
+from ucfrec_control.environments.environments import make_env, mismatches
 from ucfrec_control.environments.scores import TASKS
 from ucfrec_control.training import selection
 from ucfrec_control.training.evaluate import evaluate_run
@@ -63,6 +63,7 @@ def test_another_environment_version_warns(folder: Path) -> None:
     asked = (*LAST, "--target", 100, "--env", "Hopper-v4")
     said = control("evaluate", folder / "store-run", *asked)[1]
     assert "warning: the data is of Hopper-v5, the evaluation is in Hopper-v4" in said
+    assert not mismatches({"env_id": "Tank-v0", "versions": {}}, "mine:Tank-v0")
 
 
 def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_path: Path) -> None:
@@ -75,9 +76,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
     assert f"note: --target does nothing for {cloned} (bc)" in said
 
 
-def test_data_imports_nothing(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_runs_no_code(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "theirs.py").write_text("raise SystemExit('their code ran')")
     monkeypatch.syspath_prepend(tmp_path)
     entry = ("data", "env_id")
@@ -102,13 +101,14 @@ def test_the_weights_of_the_highest_validation_return_are_kept(
 ) -> None:
     returns, out = iter((3.0, 5.0, 4.0)), tmp_path / "rows.json"
 
-    def play(*arguments: object) -> Episodes:
+    def play(_: object, env_id: str, *arguments: object) -> Episodes:
+        assert env_id == "Hopper-v4"
         return Episodes(np.array([next(returns)]), np.array([1]))
 
     monkeypatch.setattr(selection, "play", play)
     where = (folder / "store", "--out", tmp_path / "run", "--policy", "dt")
     longer = set_options((*TINY, "train.steps=6"))
-    control("train", *where, *longer, "--select-by-return", 1)
+    control("train", *where, *longer, "--select-by-return", 1, "--env", "Hopper-v4")
     _, about = load_tensors(tmp_path / "run" / "policy" / "return.safetensors")
     assert about == {"step": 4, "return": 5.0}
     asked = ("--episodes", 1, "--checkpoint", "return", "--json", out)

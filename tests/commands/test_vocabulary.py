@@ -1,8 +1,6 @@
-"""Documentation, help and messages use the words of the field.
-
-`PHRASES` lists words that readers outside the project stumble over, each with what to write. A page
-may have a few hits, because a word can be right in one sentence and odd in another.
-"""
+"""Documentation, help and messages use the words of the field. `PHRASES` lists words that readers
+outside the project stumble over, each with what to write. A page may have a few hits, because a
+word can be right in one sentence and odd in another."""
 
 import ast
 import json

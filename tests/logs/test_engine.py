@@ -27,7 +27,6 @@ from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec.logs.tables import open_tables, quote
 
 SECRET = "the content of a file that was not named"
-
 READERS = "read_text read_blob read_csv read_json read_ndjson sniff_csv"
 SWITCHES = (
     "enable_external_access allow_community_extensions autoload_known_extensions "

@@ -29,7 +29,6 @@ from ucfrec.recommending.recommend import ItemIndex, uniforms
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
-
 SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
 FAST = [*SMALL, "rule.choose=false"]
 

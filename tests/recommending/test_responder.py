@@ -123,8 +123,8 @@ def test_candidates_of_a_large_catalogue_are_scored_without_the_others(
         some = rng.integers(24, size=1 + number % 16).tolist()
         request |= {"request_id": str(number), "candidates": some if number % 4 else None}
     expected = answered(by, asked)
-    for name in ("_LARGE", "_SPARSE"):
-        monkeypatch.setattr(module, name, 1)
+    monkeypatch.setattr(module, "_LARGE", 1)
+    monkeypatch.setattr(module, "_SPARSE", 1)
     alone = pd.concat([answered(by, [each]) for each in asked], ignore_index=True)
     for found in (answered(by, asked), alone):
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)

@@ -3,9 +3,8 @@
 python -m tests.torture --scale 0.05 --only fuzz
 python -m tests.torture --scale 0.05 --mutants
 
-Exits with 1 if a case has a fault. Every check has parts: a command, or a reader of files. With
---mutants, each part that a mutant of ucfrec breaks runs on it, and must have a fault.
-"""
+Exits with 1 if a case has a fault. With --mutants, each part of a check that a mutant of ucfrec
+breaks runs on it, and must have a fault."""
 
 import argparse
 import os

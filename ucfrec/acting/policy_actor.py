@@ -141,7 +141,8 @@ class PolicyActor:
         self._actions = torch.zeros_like(self._sessions.steps)
         if excluded is not None:
             # The environment steps rows that are not live too, so they also need an allowed action.
-            self._actions, excluded_in_rows = (~excluded).int().argmax(1), excluded[rows]
+            self._actions = (~excluded).int().argmax(1)
+            excluded_in_rows = excluded[rows]
         self._actions[rows], chances[rows] = self._decide(rows, sessions, excluded_in_rows)
         if self._shown is not None:
             self._shown[rows, self._actions[rows]] = True

@@ -72,9 +72,8 @@ def planted_vectors(
 
 
 def planted_category(out: Path, moves: float = 0.5, noise: float = 0.0) -> EpisodeStore:
-    """Eight dimensions: 0 drives itself and the reward, 1 to 5 are of a category that a trajectory
-    keeps and that moves the reward by `moves`, 6 is whether the reward is high, 7 is 0. `noise` is
-    the standard deviation of what nothing explains of the reward."""
+    """Eight dimensions: 0 drives itself and the reward, to which `noise` is added, 1 to 5 are of a
+    category that a trajectory keeps and that moves the reward, 6 is whether it is high, 7 is 0."""
     rng, trajectories, length = np.random.default_rng(0), 150, 12
     shape = (trajectories, length)
     states, actions = np.zeros((*shape, 8)), rng.uniform(-1, 1, (*shape, 1))

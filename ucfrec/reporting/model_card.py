@@ -96,10 +96,11 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
 def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
     """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
     rows = {row.method: row for row in report.rows}
-    verdict, row = report.verdict, rows[LOGGED]
-    if verdict.lift.is_reliable and verdict.estimator is not None:
-        row = rows.get(verdict.estimator, row)
-    names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
+    verdict = report.verdict
+    row = rows.get(verdict.estimator or LOGGED, rows[LOGGED])
+    names = ["effective_sessions", "sessions", "overlap"]
+    if verdict.lift.is_reliable:
+        names += ["R_cum", "lift", "probability_better"]
     files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_format_rule(row)}"
     of += ", lists" if row.conditions["positions"] else ""

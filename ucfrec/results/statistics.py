@@ -61,7 +61,7 @@ def group_auc(
     owner: Array,
     n_users: int,
 ) -> tuple[Float64Array, Float64Array]:
-    """Per user (U,): AUC times impressions, and impressions (Zhu et al., KDD 2017), both 0 for users
+    """Of users (U,): AUC times impressions, and these (Zhu et al., KDD 2017); both 0 for users
     whose steps are all liked or all not liked. The group AUC is the ratio of the sums.
 
     Args:

@@ -267,8 +267,8 @@ class RuleSearch:
         return results
 
     def _add_evidence(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The rules with evidence: of many sessions where it decides, and no lookahead is slow; of
-        few sessions, effective users count as if there were as many."""
+        """The rules with evidence: of many sessions where it decides, and no lookahead is slow;
+        effective users of few sessions count as if there were as many."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
         fast = [item for item in candidates if item not in slow]
         results = list[SimulatedRule]()
@@ -402,12 +402,10 @@ class RuleSearch:
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The mean return of a session under a rule, in simulated sessions that did not choose it,
-        for either half of the users, corrected by logged steps of that half.
-
-        Validation steps say how far the user model is off, as item vectors have seen the training
-        rewards. They are too few for weights. Training steps say how much weights would change: the
-        log's policies may have known more of users than the log shows.
-        """
+        for either half of the users, corrected by logged steps of that half: validation steps say
+        how far the user model is off, as item vectors have seen the training rewards. They are too
+        few for weights. Training steps say how much weights would change: the log's policies may
+        have known more of users than the log shows."""
         halves = [self._roll_half(rule, number) for number in (0, 1)]
         seed, users, corrections = self.problem.seed, self.users, []
         train = draw_sessions(self.problem.train, seed)
@@ -484,10 +482,8 @@ def _correct(simulated: Outcomes, logged: LoggedGains, weighted: bool = True) ->
 def choose_by_simulation(problem: Problem) -> RuleChoice:
     """Choose target, minimum target and temperature, then the reward weight, and what
     `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
-
     Rules of the highest value are then simulated in more sessions. Of rules that the model cannot
-    distinguish, the log decides.
-    """
+    distinguish, the log decides."""
     search, where = RuleSearch(problem), ""
     if (start := problem.start) is None:
         candidates = _search_all(search)

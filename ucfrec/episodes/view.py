@@ -202,9 +202,8 @@ class Columns:
         return parts
 
     def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """The states (B, K, S) before steps (B, K) of episodes with numbers (B,) in the store.
-
-        Steps are consecutive in each row; of those below 0, states are undefined.
+        """The states (B, K, S) before steps (B, K), consecutive in each row, of episodes with
+        numbers (B,) in the store; of steps below 0, they are undefined.
         """
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
         observations = torch.zeros(*steps.shape, 0)
@@ -367,8 +366,9 @@ class EpisodeView:
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
-    def step_batches(self, size: int = _BATCH_STEPS) -> Iterator[tuple[IntArray, IntArray]]:
+    def step_batches(self, most: int | None = None) -> Iterator[tuple[IntArray, IntArray]]:
         """`all_steps` in batches, for views whose steps are too many to list."""
+        size = most or _BATCH_STEPS
         for begin in range(0, self.n_steps, size):
             end = min(begin + size, self.n_steps)
             first, last = np.searchsorted(self._ends, (begin, end - 1), side="right")

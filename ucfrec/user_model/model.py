@@ -219,7 +219,8 @@ class UserSimulator:
         """Begins session i as the i-th of `store`, modulo their number, to end after `longest`
         steps; of N = `sessions` · `times`, it draws what session i modulo `sessions` draws.
         Decisions are lists of `length` items, shown in so many steps, after which sessions end."""
-        self._length, self._place = min(length, len(store.item_states.embeddings)), 0
+        self._length = min(length, len(store.item_states.embeddings))
+        self._place = 0
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
         self._logged, self._lags = LoggedRewards(store), model.rewarding.lags
@@ -254,18 +255,20 @@ class UserSimulator:
         """Show one item (M,) in every session: rewards (M,), and positions of those that go on;
         `expected` then has the expected rewards (M,)."""
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
-        history, users = self._sessions.shown.latest(self._lags), self._sessions.users
+        history = self._sessions.shown.latest(self._lags)
+        users = self._sessions.users
         if not self._place:
             # What a user thinks of a list depends on what was shown before it.
             observations = torch.from_numpy(self.observations())
             states = self._sessions.latest_states(self._store.item_states, observations)
             self._before = states, history
-        above = self._sessions.shown.latest(self._place).items
+        above = self._sessions.shown.latest(self._place)
         self._place = (self._place + 1) % self._length
         steps = self._sessions.steps.numpy()
-        self.expected = self._model.expect(*self._before, users, items, self.offer, above)
+        self.expected = self._model.expect(*self._before, users, items, self.offer, above.items)
         rewards = self._logged.draw(self.expected, self._draw_uniform())
-        ends = self._model.session_end.probabilities(history, items, rewards, steps)
+        of_list = rewards + above.rewards.sum(1).double().numpy()
+        ends = self._model.session_end.probabilities(history, items, of_list, steps)
         self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))
         ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)
         ended &= self._place == 0

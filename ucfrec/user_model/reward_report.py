@@ -130,12 +130,10 @@ def weigh_by_propensity(
     steps: IntArray,
     items: int,
 ) -> Tensor | None:
-    """What logged steps (M,) count for, as if all of `items` had been shown alike.
-
-    Of each user in proportion to 1 / (p · items), cut off at 10; those of a user add up to their
-    effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal selection
-    probabilities in multilevel models"). None if the log does not have every p.
-    """
+    """What logged steps (M,) count for, as if all of `items` had been shown alike: of each user in
+    proportion to 1 / (p · items), cut off at 10, with the sum (Σ w)² / Σ w², their effective number
+    (Pfeffermann et al., 1998, "Weighting for unequal selection probabilities in multilevel
+    models"). None if the log does not have every p."""
     propensities = read_propensities(view, episodes, steps)
     if propensities is None:
         return None

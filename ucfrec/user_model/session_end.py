@@ -32,7 +32,7 @@ _INPUTS = 4 + _LAGS + 4 + 3
 _STEPS = [0, 1]
 """Numbers of the inputs that grow with the number of the step."""
 _REWARD = 3
-"""Number of the input that is the step's reward."""
+"""Number of the input that is the reward: of the step, or of the whole list."""
 _FEWEST = 20
 """Fewest steps that end a session, and that do not, that tell more than their share."""
 _STEP = 2.0**-10
@@ -84,7 +84,12 @@ class LoggedEnds:
         last = store.decision_ends(episodes, steps) == steps + 1
         episodes, steps = episodes[last], steps[last]
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-        rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+        starts = store.decision_starts(episodes, steps)
+        counts = steps + 1 - starts
+        owner = np.repeat(np.arange(len(steps)), counts)
+        of_list = starts[owner] + np.arange(len(owner)) - (counts.cumsum() - counts)[owner]
+        earned = store.step_values(schema.REWARD, episodes[owner], of_list)
+        rewards = np.bincount(owner, earned, len(steps)).astype(np.float64)
         history = Shown.before(store, episodes, steps, lags)
         inputs = describe_steps(likeness, history, torch.from_numpy(items), rewards, steps)
         followed = ~last_sessions(store) if store.has_users else np.ones(len(store), dtype=bool)
@@ -110,7 +115,8 @@ def whole_sessions(
     where most validation sessions go on from training sessions that the split cut."""
     if not (train.has_users and validation.has_users):
         return train, validation
-    users, cut = train.episode_values(schema.USER), ~train.terminated & last_sessions(train)
+    users = train.episode_values(schema.USER)
+    cut = ~train.terminated & last_sessions(train)
     if np.isin(validation.episode_values(schema.USER), users[cut]).mean() < 0.5:
         return train, validation
     held_out = users.astype(np.int64) % 5 == 4
@@ -130,12 +136,10 @@ class SessionEndReport:
 
 
 class SessionEnd:
-    """The probability that a session ends with a step.
-
-    A constant, a logistic regression, or boosted trees, of the number of the step, its reward, how
-    alike its item is to each of the last ten, the largest of these over the last 2, 3, 4 and 10,
-    and how often the item was shown in the last 1, 3 and 10.
-    """
+    """The probability that a session ends with a step: a constant, a logistic regression, or
+    boosted trees, of the number of the step, its reward or that of its whole list, how alike its
+    item is to each of the last ten, the largest of these over the last 2, 3, 4 and 10, and how
+    often the item was shown in the last 1, 3 and 10."""
 
     def __init__(self, likeness: Likeness, tensors: Mapping[str, Tensor]) -> None:
         """Of tensors of `BoostedTrees`; or, float64, of the `highest` (F,) inputs that count, their
@@ -238,7 +242,8 @@ class SessionEnd:
         lately, _ = history.padded(_LAGS)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
         alike = self._likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
-        repeated, number = history.items.unsqueeze(2) == items.unsqueeze(1), steps.unsqueeze(1)
+        repeated = history.items.unsqueeze(2) == items.unsqueeze(1)
+        number = steps.unsqueeze(1)
         columns = (_columns(alike, repeated, entry, number) for entry in rewards)
         inputs = torch.cat([torch.stack(entries).flatten(1) for entries in columns], 1)
         odds = self._log_odds(inputs.T)

@@ -445,7 +445,8 @@ class RuleSearch:
     def _read_gains(self, sessions: EpisodeStore, expected: Float64Array) -> list[LoggedGains]:
         """All steps of logged sessions, with `expected` rewards, of either half of the users."""
         episodes, steps = sessions.all_steps()
-        propensities, weights = read_propensities(sessions, episodes, steps), np.ones(len(steps))
+        propensities = read_propensities(sessions, episodes, steps)
+        weights = np.ones(len(steps))
         if propensities is not None:
             weights = np.minimum(1 / propensities, _RAREST * len(self.users.rewarding.item))
         gains = sessions.step_values(schema.REWARD, episodes, steps) - expected
@@ -517,8 +518,8 @@ def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     grid = {"temperature": config.temperatures} if search.list_size > 1 else {}
     candidates += search.simulate(_vary(first, reward_weight=config.reward_weights, **grid))
     second = search.best(candidates).rule
-    if search.users.session_end_report.kept != "constant":
-        # More than randomness ends sessions.
+    if search.list_size == 1 and search.users.session_end_report.kept != "constant":
+        # More than randomness ends sessions, and a step is a whole decision.
         grid = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
         candidates += search.simulate(_vary(second, lookahead=_lookaheads(problem), **grid))
     if _knows_lists(problem):
@@ -613,7 +614,7 @@ def find_neighbours(
         grid["reward_weight"] = [*config.lookahead_weights]
         weight = median_high(config.reward_weights)
         yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
-    elif problem.users.session_end_report.kept != "constant":
+    elif problem.train.usual_list() == 1 and problem.users.session_end_report.kept != "constant":
         middle = median_high(config.policy_weights)
         for ahead, weight in product(_lookaheads(problem), config.lookahead_weights):
             plain = replace(rule, by_marginal_gain=False, policy_weight=middle)

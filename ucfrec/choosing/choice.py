@@ -44,7 +44,7 @@ class RuleConfig:
     reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
     lookaheads: Annotated[tuple[Weight, ...], _SOME] = (0.0, 4.0, 16.0)
-    """Candidates for the lookahead, in mean rewards, where the log shows what ends sessions."""
+    """Candidates for the lookahead, in mean rewards, where single items end sessions in the log."""
     lookahead_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (8.0, 32.0)
     """Candidates for β with a lookahead, where it is the weight of rewards scaled to [0, 1]."""
     policy_weights: Annotated[tuple[Weight, ...], _SOME] = (0.0, 0.5, 1.0)

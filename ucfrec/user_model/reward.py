@@ -124,9 +124,8 @@ class ItemRewardModel(nn.Module):
     is 0 at the top of a list; below, it is the effect of the place, and of the likeness to the
     items above, summed: `scores` are of the top, so that places change no choice. What the user was
     shown until the decision adds to user_u and affinity_u (`Interests`); for new users, these are
-    what the session shows (`UserPosterior`).
-    Item effects include those of tags and embeddings, which items without training rows have too.
-    η is the log-odds of the higher of two rewards, otherwise the standardised reward.
+    what the session shows (`UserPosterior`). Item effects include those of tags and embeddings, as
+    of new items. η is the log-odds of the higher of two rewards, otherwise the standardised reward.
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:

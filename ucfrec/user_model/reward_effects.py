@@ -401,7 +401,7 @@ class Beginning:
                     effects[name] = old[users.clamp(max=len(old) - 1)]
                 elif new.shape == old.shape:
                     effects[name] = old
-                elif name == "item":
+                elif name == "item" and old.ndim == 1:
                     effects[name] = F.pad(old, (0, len(new) - len(old)))
         numbers = np.abs(np.subtract.outer([e.spread for e in entries], _SPREADS)).argmin(1)
         pairs = zip(entries, numbers.tolist(), strict=True)
@@ -459,7 +459,7 @@ class EffectSearch:
 
             # How much users differ, relative to noise, is chosen by the held-out loss.
             self.set_tastes(min(_SCALES, key=loss) * root)
-        no_one = bool((self.design.users == len(self.design.fitted_users)).all())
+        no_one = not (self.design.users < len(self.design.fitted_users)).any()
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
         near, strides = _FIRST, _STRIDES.get(name, (2,))

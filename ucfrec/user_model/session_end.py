@@ -334,7 +334,8 @@ class BoostedTrees:
         self._leaves, self._base = leaves, base
         self._powers = 2.0 ** torch.arange(inputs.shape[1])
         # First splits of all trees, second ones, and so on.
-        self._numbers, self._thresholds = inputs.T.flatten(), thresholds.T.reshape(-1, 1)
+        self._numbers = inputs.T.flatten()
+        self._thresholds = thresholds.T.reshape(-1, 1)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) from inputs (M, F)."""

@@ -79,6 +79,7 @@ WRONG = {
     "one": {"propensity": np.ones(5000)},
     "some lacking": {"propensity": np.where(np.arange(5000) % 10, STEPS.propensity, np.nan)},
     "all lacking": {"propensity": np.full(5000, np.nan)},
+    "one buyer": {"reward": STEPS.reward + 500.0 * (np.arange(5000) == 7)},
     # The policy repeats one item that never had a reward: not "0 [0, 0]".
     "nothing rewarded": {"reward": STEPS.reward * (SHOWN != 3), "target": 1.0 * (SHOWN == 3)},
 }
@@ -94,6 +95,7 @@ WRONG = {
             "all lacking",
             "cannot say: no session has all its propensities, so nothing can be weighed",
         ),
+        ("one buyer", "one user has [2-5].% of all weighted reward: cap"),
         ("nothing rewarded", "no session has both weight and reward"),
     ],
 )

@@ -69,6 +69,8 @@ class Diagnosis:
     """Share of the heaviest user in all weight."""
     rewarded_users: int = 0
     """Users with a session that has both weight and reward."""
+    largest_return: float = 0.0
+    """Share of one user in all weighted returns, whatever their sign."""
     mean_weight: float | None = None
     """Mean session product, 1 in expectation."""
     tail: float | None = None
@@ -106,6 +108,7 @@ def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
         effective_users=effective_number(by_user),
         largest_weight=largest_share(by_user),
         rewarded_users=int((rewarded > 0).sum()),
+        largest_return=largest_share(rewarded),
         mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
     )
@@ -225,6 +228,10 @@ def list_reasons(diagnosis: Diagnosis) -> list[str]:
         reasons.append("no session has both weight and reward: the logs support no estimate")
     elif count < ENOUGH_REWARDED:
         reasons.append(f"only {count} users have both weight and reward (below {ENOUGH_REWARDED})")
+    elif diagnosis.largest_return > DOMINANT:
+        share = f"{diagnosis.largest_return:.0%} of all weighted reward"
+        remedy = "cap rewards, as in least(revenue, 500), or give more logs"
+        reasons.append(f"one user has {share}: {remedy}")
     if diagnosis.largest_weight > DOMINANT:
         reasons.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
     if (tail := diagnosis.tail or 0.0) > HEAVY_TAIL:

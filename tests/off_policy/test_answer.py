@@ -48,8 +48,7 @@ def test_a_planned_test_finds_the_lift_four_times_in_five() -> None:
     rng = np.random.default_rng(0)
     rates = rng.beta(1, 3, 300)  # each of a user with five sessions
     returns = (rng.random((300, 5)) < rates[:, None]).astype(float).ravel()
-    session = np.arange(1500)
-    ones = np.ones(1500)
+    session, ones = np.arange(1500), np.ones(1500)
     steps = LoggedSteps(session, returns, ones, ones, user=session // 5)
     plan = plan_test(steps, 0.05, days=3)
     assert plan.days == pytest.approx(3 * plan.users / 300, rel=0.01)
@@ -71,8 +70,7 @@ def test_a_planned_exploration_leaves_enough_users(users: int) -> None:
     traffic = Traffic(days=1.0, users=users, steps=5 * users, draws=50.0)
     share, days = (float(word) for word in traffic.plan_exploration().split() if word[0].isdigit())
     served = int(users * days)
-    explored = rng.random(5 * served) < share
-    shown = explored & (rng.random(5 * served) < 1 / 50)
+    shown = (rng.random(5 * served) < share) & (rng.random(5 * served) < 1 / 50)
     weights = np.where(shown, 50 / share, 0.0)
     user = np.repeat(np.arange(served), 5)
     target = weights / weights.max()
@@ -95,5 +93,4 @@ def test_steps_answer_where_sessions_cannot() -> None:
     bad = replace(steps, target=TARGET[::-1][items])
     assert replace(verdict, per_step=conclude(cut_to_steps(bad), 0)).answer == "do not launch"
     doubted = conclude(cut_to_steps(steps), 0, forbidden=["seen in training"])
-    doubted = replace(verdict, per_step=doubted)
-    assert doubted.answer == "the log cannot say"
+    assert replace(verdict, per_step=doubted).answer == "the log cannot say"

@@ -78,16 +78,13 @@ def test_groups_add_up_and_their_intervals_are_wider(of_items: bool) -> None:
     groups = Groups(("even", "odd", "few"), number, of_items)
     even, odd, few = compare_groups(groups, steps, lifts, 0)
     if of_items:
-        assert few.difference.reasons == (
-            "no session has both weight and reward: the logs support no estimate",
-        )
+        assert "no session has both weight and reward: the logs support no" in str(few)
         total = even.difference.value + odd.difference.value
         assert total == pytest.approx(lifts.mean(), abs=0.02)
     else:
         assert few.difference.low is None
         assert "effective of 100 users (below 200)" in str(few)
-        mean = lifts[number == 0].mean()
-        assert even.difference.value == pytest.approx(mean)
+        assert even.difference.value == pytest.approx(lifts[number == 0].mean())
         width = even.difference.high - even.difference.low
         assert width > 2 * 2.1 * lifts[number == 0].std() / even.users**0.5
     assert odd.difference.is_reliable

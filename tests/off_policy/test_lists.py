@@ -73,8 +73,7 @@ def random_lists(seed: int) -> LoggedSteps:
             session += [number] * size
             place += range(size)
     n = len(session)
-    columns = rng.random((4, n))
-    model = Modelled(*columns)
+    model = Modelled(*rng.random((4, n)))
     chances = rng.uniform(0.2, 1.0, size=(2, n))
     return LoggedSteps(np.array(session), rng.random(n), *chances, model, place=np.array(place))
 

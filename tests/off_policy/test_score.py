@@ -34,8 +34,6 @@ from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
-
-
 RULES = {
     "drawn": RULE,
     "best": DecisionRule(7.5),
@@ -81,8 +79,7 @@ def test_nothing_later_is_looked_at(log: pd.DataFrame, trained: TrainedPolicy, r
     """Rewards and items from a step on, changed: it is scored as before."""
     log = log.sort_values(["user_id", "timestamp"])
     gaps = (log.timestamp.diff() > 20 * 60_000) | (log.user_id.diff() != 0)
-    session = gaps.cumsum()
-    later = log.groupby(session).cumcount() >= 1
+    later = log.groupby(gaps.cumsum()).cumcount() >= 1
     changed = log.assign(
         reward=np.where(later, 1 - log.reward, log.reward),
         item_id=np.where(later, (log.item_id + 7) % 30, log.item_id),
@@ -121,9 +118,8 @@ def test_features_are_means_over_items(trained: TrainedPolicy, logged: LoggedSes
     for item in range(probabilities.shape[1]):
         shown = torch.full_like(batch.items, item)
         target, _, seen = make_inputs(trained, replace(batch, items=shown))
-        of_item, _ = seen.features()
         np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
-        mean += probabilities[:, item, None] * of_item
+        mean += probabilities[:, item, None] * seen.features()[0]
     np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
 
 
@@ -268,8 +264,7 @@ def test_a_run_that_was_moved_with_its_store_finds_it(
         moved = replace(trained, record=trained.record.copy_with(**places))
         assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
     record = trained.record.copy_with(store=str(tmp_path / "gone"))
-    found = store_of(tmp_path / "run", record)
-    assert found.path == (tmp_path / "store").resolve()
+    assert store_of(tmp_path / "run", record).path == (tmp_path / "store").resolve()
     (tmp_path / "store").rename(tmp_path / "elsewhere")
     assert store_of(tmp_path / "run", record) is None
     assert store_of(tmp_path / "run", trained.record) is not None

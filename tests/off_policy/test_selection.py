@@ -89,7 +89,7 @@ def test_one_clear_winner_loses_nothing() -> None:
     assert found.standings[0].probability_best == 1
     assert found.regret == 0
     assert found.corrected == pytest.approx(found.standings[0].value, abs=0.01)
-    assert found.headline.startswith("No other has a higher value than c: ")
+    assert found.headline.startswith("No other candidate has a higher value than c: ")
     assert [one.rank for one in found.standings] == [1, 2, 3, 4]
 
 
@@ -121,6 +121,7 @@ def test_only_candidates_whose_verdicts_stand_are_ranked() -> None:
     }
     choice = choose(reports, seed=0)
     assert [one.name for one in choice.standings] == ["later", "uniform"]
+    assert choice.headline.startswith("No other candidate that these logs can evaluate has")
     assert "propensities are too small" in choice.excluded["propensities wrong"]
     later = choice.columns("later")
     assert later["band_low"] < test_verdict.value() < later["band_high"]
@@ -139,10 +140,8 @@ def test_candidates_that_cannot_be_compared_are_refused() -> None:
     other = replace(steps, reward=1 - steps.reward)
     with pytest.raises(InputError, match="a and b read these logs as different"):
         choose({"a": report(steps), "b": report(other)}, seed=0)
-    for terms, says in (
-        (np.ones((5, 2)), r"\(5, 2\)"),
-        (np.full((5, 1), np.nan), "not finite at 5"),
-    ):
+    bad = {r"\(5, 2\)": np.ones((5, 2)), "not finite at 5": np.full((5, 1), np.nan)}
+    for says, terms in bad.items():
         with pytest.raises(InputError, match=says):
             select(["a"], terms, 0)
     with pytest.raises(InputError, match="give a column to each of 0"):

@@ -69,20 +69,18 @@ class Ope(RuleOptions, LogOptions):
 
         runs, logs = find_runs(self.logs)
         settings = settings_given(self, evaluate.EstimateOptions)
-        if self.lift is not None:
-            settings["wanted_lift"] = self.lift
         settings |= {"users_known": not self.anonymous, "guardrails": tuple(self.guardrail)}
+        settings["wanted_lift"] = self.lift
         options = evaluate.EstimateOptions(**settings)
         # On the test split, the weights that have not learned from it.
         policies = [self.load(run, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
-        parts = [(policy.folder, rule) for policy, rules in candidates for rule in rules]
-        names = names_of(
-            [
-                {"run": str(run), "target return": rule.target, "temperature": rule.temperature}
-                for run, rule in parts
-            ]
-        )
+        parts = [
+            {"run": str(run.folder), "target return": rule.target, "temperature": rule.temperature}
+            for run, rules in candidates
+            for rule in rules
+        ]
+        names = names_of(parts)
         reports: dict[str, OffPolicyReport] = {}
         details: list[str] = []
         for policy, rules in candidates:

@@ -169,7 +169,7 @@ class _Means:
     def check(self, guardrail: Guardrail, reasons: Sequence[str]) -> Guardrail:
         """The change of the second arm, as a share of the first."""
         (a, b), (error_a, error_b) = self.values, self.errors
-        faults = (*reasons, *self.list_faults(), *(["its mean is not above 0"] if a <= 0 else []))
+        faults = (*reasons, *self.list_faults(), *["its mean is not above 0"] * (a <= 0))
         if faults:
             return replace(guardrail, change=Evidence(None, None, None, faults))
         variance = (error_b / a) ** 2 + (b * error_a / a**2) ** 2
@@ -344,11 +344,9 @@ def _sum_by_user(
                 f"{f'CAST({part.sql} AS VARCHAR)' if part else 'NULL'} AS part "
                 f"FROM {table.add_texts(columns, (schema.USER_ID, schema.ARM)).sql}"
             )
-        begins = (
-            "true"
-            if gap_minutes is None
-            else (f"coalesce(time - lag(time) OVER sessions > {60_000 * gap_minutes}, true)")
-        )
+        begins = "true"
+        if gap_minutes is not None:
+            begins = f"coalesce(time - lag(time) OVER sessions > {60_000 * gap_minutes}, true)"
         mixed = "coalesce(min(arm) OVER users <> max(arm) OVER users, false)"
         with explain_errors(connection, tables):
             rows: pd.DataFrame = connection.execute(

@@ -65,13 +65,12 @@ class Traffic:
         """The share of random items, and for how many days, that lets each step be evaluated."""
         if not self.days:
             return ""
-        # Sums of n weights of a user have a variance of (E[w²] − 1) / n, in units of their mean.
-        spreads = [(self.draws / share - 1) * self.users / self.steps for share in _SHARES]
-        days = [self.days * ENOUGH_USERS * (1 + spread) / self.users for spread in spreads]
-        share, wait = next(
-            (pair for pair in zip(_SHARES, days, strict=True) if pair[1] <= _MOST_DAYS),
-            (_SHARES[-1], days[-1]),
-        )
+        for share in _SHARES:
+            # Sums of n weights of a user have a variance of (E[w²] − 1) / n, in units of the mean.
+            spread = (self.draws / share - 1) * self.users / self.steps
+            wait = self.days * ENOUGH_USERS * (1 + spread) / self.users
+            if wait <= _MOST_DAYS:
+                break
         return (
             f"serve with --explore {share:g} for {_format_days(wait)} of such traffic, after which "
             "each step can be evaluated"
@@ -155,8 +154,6 @@ class Verdict:
     logged: float
     """Mean return of a session as logged."""
     effective_users: float
-    probability_better: float | None
-    """Share of the bootstrap's resamples in which the lift is above 0."""
     wanted_lift: float
     """Return per session that a launch should gain."""
     test: ABTest | None
@@ -200,13 +197,12 @@ class Verdict:
         if not self.lift.is_reliable and self.per_step is not None:
             return f"{says}: {self.per_step.lift.format()} per step, by DR{rests_on}"
         share = self.lift.value / abs(self.logged) if self.lift.value and self.logged else 0.0
-        outcomes = {guardrail.outcome for guardrail in self.guardrails}
         why = f", less than the wanted gain of {self.wanted_lift:.3g}"
         if self.lift.standing() in ("better", "worse"):
             why = "" if says != "test it" else ", but a guardrail is open"
         elif says == "test it":
             why = ", no reliable gain or loss"
-        if "broken" in outcomes:
+        if any(guardrail.outcome == "broken" for guardrail in self.guardrails):
             why = ", but a guardrail is broken"
         return f"{says}: {self.lift.format()} per session ({share:+.1%}){why}{rests_on}"
 
@@ -252,8 +248,7 @@ class Verdict:
             "groups": [asdict(group) for group in self.groups],
             "test": self.test and asdict(self.test),
         }
-        names = ("probability_better", "wanted_lift", "declared")
-        return columns | {name: getattr(self, name) for name in names}
+        return columns | {"wanted_lift": self.wanted_lift, "declared": self.declared}
 
 
 def conclude(
@@ -282,13 +277,12 @@ def conclude(
         (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
         if interval is None:
             reasons += NO_SPREAD.reasons
-    low, high, _, better = interval or NO_INTERVAL
+    low, high, _ = interval or NO_INTERVAL
     return Verdict(
         lift=Evidence(value, low, high, tuple(reasons)),
         estimator=name,
         logged=float(steps.returns.mean()),
         effective_users=diagnosis.effective_users,
-        probability_better=better,
         wanted_lift=wanted_lift,
         test=plan_test(steps, wanted_lift, days),
         declared=declared,

@@ -95,18 +95,22 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
     above, below = np.stack([(term.above, term.below) for term in terms.values()], axis=2)
     estimates, intervals = {}, cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
-        low, high, error, _ = NO_INTERVAL if term.doubt or interval is None else interval
-        weights = term.weights
+        low, high, error = NO_INTERVAL if term.doubt or interval is None else interval
         estimates[name] = Estimate(
             value=float(term.above.sum() / term.below.sum()),
             low=low,
             high=high,
             reasons=(term.doubt,) if term.doubt else (),
             error=error,
-            effective_sessions=effective_number(weights),
-            largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
+            effective_sessions=effective_number(term.weights),
+            largest_weight=largest_share(term.weights),
         )
     return estimates
+
+
+def largest_share(weights: Float64Array) -> float:
+    """Share of the largest of weights (n,) in their sum; 1 where there is none."""
+    return float(weights.max() / weights.sum()) if weights.any() else 1.0
 
 
 def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
@@ -193,11 +197,9 @@ class Interval(NamedTuple):
     high: float
     error: float
     """Standard error, over clusters."""
-    above_zero: float
-    """Share of resamples in which the number is above 0."""
 
 
-NO_INTERVAL = (None, None, None, None)
+NO_INTERVAL = (None, None, None)
 NO_SPREAD = Evidence(None, None, None, ("the sessions do not differ enough for an interval",))
 
 
@@ -221,15 +223,15 @@ def cluster_intervals(
     """
     resamples = resample(above, below, cluster, seed)
     intervals: list[Interval | None] = []
-    for k, (value, error) in enumerate(zip(resamples.value, resamples.error, strict=True)):
-        rows = np.isfinite(resamples.studentised[:, k])
-        if rows.mean() < _USABLE:
+    columns = resamples.value, resamples.error, resamples.studentised.T
+    for value, error, deviations in zip(*columns, strict=True):
+        usable = deviations[np.isfinite(deviations)]
+        if len(usable) < _USABLE * RESAMPLES:
             intervals.append(None)
             continue
-        low_t, high_t = np.quantile(resamples.studentised[rows, k], [0.025, 0.975])
-        above_zero = float((value + resamples.shift[rows, k] > 0).mean())
+        low_t, high_t = np.quantile(usable, [0.025, 0.975])
         low, high = float(value - high_t * error), float(value - low_t * error)
-        intervals.append(Interval(low, high, float(error), above_zero))
+        intervals.append(Interval(low, high, float(error)))
     return intervals
 
 
@@ -281,9 +283,7 @@ def resample(
         shuffled = np.random.default_rng(seed).permutation(clusters)
         names, clusters = shuffled[names] % MOST_CLUSTERS, MOST_CLUSTERS
     above, below = (
-        np.stack([np.bincount(names, column, clusters) for column in values.T], axis=1).astype(
-            np.float64, copy=False
-        )
+        np.stack([np.bincount(names, column, clusters) for column in values.T], 1, dtype=float)
         for values in (above, below)
     )
     with np.errstate(divide="ignore", invalid="ignore"):  # where nothing has weight

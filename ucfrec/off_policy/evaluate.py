@@ -446,7 +446,7 @@ def collect_steps(
         propensity=propensity,
         target=np.zeros(store.n_steps),
         place=place,
-        user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
+        user=logged.users if options.users_known else None,
         discount=options.discount,
     )
     if len(np.unique(plain.users)) < 2:

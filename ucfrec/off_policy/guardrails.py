@@ -9,6 +9,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import (
+    NO_INTERVAL,
     NO_SPREAD,
     cluster_intervals,
     estimate_by_step,
@@ -17,7 +18,7 @@ from ucfrec.off_policy.estimators import (
 from ucfrec.off_policy.logged_steps import LoggedSteps, merge_lists
 from ucfrec.off_policy.verdict import diagnose, list_reasons
 from ucfrec.results.evidence import UNMEASURED, Evidence
-from ucfrec.settings import require
+from ucfrec.settings import SettingError
 
 _WRITTEN = re.compile(r"\s*(\S.*?)\s*(>=|<=)\s*([+-]?\d+(?:\.\d+)?)\s*%\s*")
 _OUTCOMES = {"better": "holds", "worse": "broken"}
@@ -38,16 +39,15 @@ class Guardrail:
     def parse(cls, text: str) -> Self:
         """Read `dwell_seconds >= -2%`; InputError if it is not written so."""
         match = _WRITTEN.fullmatch(text)
-        require(match is not None, f"guardrail {text!r}: write e.g. 'dwell_seconds >= -2%'")
-        assert match is not None
+        if match is None:
+            raise SettingError(f"guardrail {text!r}: write e.g. 'dwell_seconds >= -2%'")
         return cls(match[1], match[2] == ">=", float(match[3]) / 100)
 
     @property
     def outcome(self) -> str:
         """Whether it holds, is broken, or open."""
-        sign, ends = (1, (self.change.low, self.change.high))
-        if not self.at_least:
-            sign, ends = -1, ends[::-1]
+        sign = 1 if self.at_least else -1
+        ends = (self.change.low, self.change.high)[::sign]
         low, high = (None if end is None else sign * (end - self.bound) for end in ends)
         return _OUTCOMES.get(Evidence(None, low, high, self.change.reasons).standing(), "open")
 
@@ -106,7 +106,7 @@ def check_guardrail(
             value = float(changes.sum() / logged.sum())
             (ends,) = cluster_intervals(changes[:, None], logged[:, None], measured.user, seed)
             reasons = () if ends else NO_SPREAD.reasons
-    low, high = (ends.low, ends.high) if ends else (None, None)
+    low, high, _ = ends or NO_INTERVAL
     return replace(guardrail, change=Evidence(value, low, high, tuple(reasons)))
 
 

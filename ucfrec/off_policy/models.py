@@ -43,10 +43,9 @@ class StepInputs:
 
     def features(self) -> tuple[Float32Array, Float32Array]:
         """Features (B, P) of state and logged item, and their mean over the evaluated policy's."""
-        return (
-            self._cross(self.chosen, self.scores[:, [0]]),
-            self._cross(self.expected, self.scores[:, [1]]),
-        )
+        score = self.scores[:, :1]
+        mean_score = self.scores[:, 1:]
+        return self._cross(self.chosen, score), self._cross(self.expected, mean_score)
 
     def _cross(self, items: Tensor, score: Tensor) -> Float32Array:
         """Features (B, P), linear in item embeddings (B, D) and score (B, 1)."""

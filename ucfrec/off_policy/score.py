@@ -330,7 +330,7 @@ def seen_too_often(seen: float | None) -> list[str]:
         f"{seen or 0:.0%} of the rows were seen in training: on these a policy looks "
         "better than it is; give later logs, or no logs for the test split"
     )
-    return [text] if seen is not None and seen > MOST_SEEN else []
+    return [text] if (seen or 0) > MOST_SEEN else []
 
 
 def _hash_rows(store: EpisodeStore) -> Iterator[Array]:

@@ -62,16 +62,16 @@ class Selection:
         if not self.standings:
             return "The logs allow no conclusion on any of the candidates"
         first = self.standings[0]
+        candidate = "candidate" + " that these logs can evaluate" * bool(self.excluded)
         if len(self.standings) == 1:
-            supported = " that these logs can evaluate" * bool(self.excluded)
-            return f"{first.name} is the only candidate{supported}"
+            return f"{first.name} is the only {candidate}"
+        value = f"{self.corrected:.4g} per session"
         sure = f"best with probability {first.probability_best:.2f}"
         if self.regret == 0:
-            value = f"{self.corrected:.4g} per session, {sure}"
-            return f"No other has a higher value than {first.name}: {value}"
+            return f"No other {candidate} has a higher value than {first.name}: {value}, {sure}"
         return (
-            f"{first.name} comes first: {self.corrected:.4g} per session once corrected for the "
-            f"choice ({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
+            f"{first.name} is the first {candidate}: {value} once corrected for the choice "
+            f"({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
         )
 
     def columns(self, name: str) -> dict[str, Any]:

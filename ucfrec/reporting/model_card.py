@@ -100,7 +100,7 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     row = rows.get(verdict.estimator or LOGGED, rows[LOGGED])
     names = ["effective_sessions", "sessions", "overlap"]
     if verdict.lift.is_reliable:
-        names += ["R_cum", "lift", "probability_better"]
+        names += ["R_cum", "lift"]
     files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_format_rule(row)}"
     of += ", lists" if row.conditions["positions"] else ""

@@ -106,7 +106,6 @@ def update_run(
     record = train_run(opened, out, config, {"update": update}, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
-        # The drift of the new rows and the verdict.
         added = opened.select(np.arange(opened.n_episodes)[-record.update.episodes :])
         training, seed = store_before.split("train"), config.seed
         changes = measure_drift(trained, training, added, counts, seed)

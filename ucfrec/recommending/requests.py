@@ -232,10 +232,11 @@ class RowRewards:
             try:
                 columns[name] = pa.array(_column(rows, name))
             except (pa.ArrowException, OverflowError) as error:
-                types = str(error).splitlines()[0]
-                raise InputError(f"history: {name} has values of several types ({types})") from None
-        # A constant, as of logs in which users chose every row, has no columns.
-        connection.register(_ROWS, pa.table(columns or {_ROWS: [0] * len(rows)}))
+                reason = str(error).splitlines()[0]
+                raise InputError(
+                    f"history: {name} has values of several types ({reason})"
+                ) from None
+        connection.register(_ROWS, pa.table(columns or {_ROWS: [0] * len(rows)}))  # a constant
         described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
         table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
         try:

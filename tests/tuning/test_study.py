@@ -166,3 +166,5 @@ def test_what_cannot_be_searched(store: Path, tmp_path: Path) -> None:
     search = Search(("dt",), FIXED | {"train.steps": 2, "policy.dim": 4}, False, 0)
     study = tune(Plan(tmp_path / "store", tmp_path / "tuned", search, "ndcg"), 2)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
+    best = RunRecord.read(tmp_path / "tuned" / BEST).ranking
+    assert best.ndcg == pytest.approx(study.best_value)  # `train` measures it as `rank` does

@@ -428,6 +428,7 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     "split is 0.8; give three shares, two": lambda p, log: p.fit(log, split=0.8),
     "split '1,x': write shares as .* ISO": lambda p, log: p.fit(log, split=(1, "x")),
     "reward is 1; give text": lambda p, log: p.fit(log, reward=1),
+    "name it with reward, or give reward='1' if": lambda p, log: p.fit(log.iloc[:, :3]),
     "on_step is 3; give a function": lambda p, log: p.fit(log, on_step=3),
     "out is 3; give a path": lambda p, log: p.fit(log, 3),
     "mapping is {'user_id': 3}; give a LogMapping, a TOML file, or a dic": (

@@ -147,8 +147,7 @@ def test_a_row_does_not_tell_the_trees_what_they_predict(
     """The rate of an item is the same in a fold whether the row itself was liked or not."""
     policy, store = fitted
     inputs, liked = policy._training_rows(store, np.arange(store.n_steps))
-    episodes, _ = store.all_steps()
-    items = store.column("item")
+    episodes, items = store.all_steps()[0], store.column("item")
     for item in range(3):
         rows = (items == item) & (episodes % 5 == 0)
         assert len(np.unique(inputs[rows, 0])) == 1

@@ -65,10 +65,9 @@ def test_the_best_trial_is_the_run_that_is_kept(store: Path, tmp_path: Path) -> 
     searched = plan(store, tmp_path / "tuned", ("dt", "item-rate"), "ndcg")
     study = tune(searched, 4)
     assert len(list_finished(study)) == 4
-    best = searched.out / BEST
     left = {path.name for path in searched.out.iterdir()}
     assert left == {BEST, "best.toml", "tuning.md", "study.db", "stages"}
-    trained = TrainedPolicy.load(best)
+    trained = TrainedPolicy.load(searched.out / BEST)
     assert measure_run(trained, EpisodeStore.open(store), "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
@@ -87,8 +86,7 @@ def test_a_search_goes_on_and_gives_the_same_trials(store: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
-    study = tune(plan(store, tmp_path / "tuned"), 4, workers=2)
-    assert len(list_finished(study)) == 4
+    assert len(list_finished(tune(plan(store, tmp_path / "tuned"), 4, workers=2))) == 4
     assert (tmp_path / "tuned" / BEST / RunRecord.FILE).exists()
 
 
@@ -100,8 +98,7 @@ def test_a_killed_trial_is_run_again_in_a_folder_of_any_name(store: Path, tmp_pa
     alter(searched, "UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
     alter(searched, "DELETE FROM trial_values")
     resumed = tune(searched, 1)
-    states = [trial.state.name for trial in resumed.trials]
-    assert states == ["FAIL", "COMPLETE"]
+    assert [trial.state.name for trial in resumed.trials] == ["FAIL", "COMPLETE"]
     assert resumed.trials[0].params == resumed.trials[1].params
     alter(searched, "UPDATE trials SET state = 'LOST'")
     with pytest.raises(InputError, match=r"study\.db is damaged \(LookupError: 'LOST' is not"):

@@ -287,14 +287,17 @@ class ItemKNNPolicy(ScoringPolicy):
         numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
         episodes, steps = held_out.locate(numbers)
         windows = held_out.windows(episodes, steps, self.config.context).to(self.cosines.device)
-        shown, items = Shown.before_last(windows), windows.actions[:, -1:]
+        shown = Shown.before_last(windows)
+        items = windows.actions[:, -1:]
         scores = self.similarity(shown.items, shown.rewards)
-        of_shown, bias = scores.gather(1, items).mean(), self.head.get_parameter("bias").detach()
+        of_shown = scores.gather(1, items).mean()
+        bias = self.head.get_parameter("bias").detach()
         seen = torch.zeros(len(scores), len(bias) + 1, dtype=torch.bool, device=bias.device)
         seen = seen.scatter_(1, shown.items % seen.shape[1], True)[:, :-1]  # the last is for none
         if not seen.gather(1, items).any():  # sessions in which no item is shown twice
             bias = bias.where(~seen, -torch.inf)
-        low, high = 0.0, _HOTTEST
+        low = 0.0
+        high = _HOTTEST
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
             expected = (middle * scores + bias).softmax(-1).mul(scores).sum(-1).mean()

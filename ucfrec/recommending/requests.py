@@ -53,8 +53,7 @@ _TYPES = ("constrained-str", "float", "constrained-int", "int", "str")
 _ROWS = "history"
 """Name of the rows in messages and in the engine."""
 _MEMORY = "512MB"
-"""Of which the engine may take half: a request is some megabytes, and no expression makes much more
-of it."""
+"""Half of it is the engine's: a request has some megabytes, and no expression needs much more."""
 
 
 TIME_FORMS = "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
@@ -137,8 +136,7 @@ class StreamRequest(Request):
     """A request of a stream, which remembers its users."""
 
     interactions: Annotated[list[Row], Field(fail_fast=True)] = []
-    """Rows that are added to the history or, without one, to what the stream has had of the
-    user."""
+    """Rows after the history or, without one, after what the stream has had of the user."""
 
 
 def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
@@ -197,7 +195,8 @@ class RowRewards:
     """
 
     def __init__(self, expression: Expression) -> None:
-        self._expression, self._computed = expression, computes_with_reward(expression)
+        self._expression = expression
+        self._computed = computes_with_reward(expression)
         self._stack = ExitStack()
         self.close = self._stack.close
         """Close the engine."""
@@ -220,8 +219,10 @@ class RowRewards:
         return _require_numbers(self._evaluate(rows), "no reward")
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        connection, source = self._connection, Path(_ROWS)
-        names, columns = {name.casefold() for row in rows for name in row}, {}
+        connection = self._connection
+        source = Path(_ROWS)
+        names = {name.casefold() for row in rows for name in row}
+        columns: dict[str, Any] = {}
         for name in columns_of(connection, self._expression):
             if name.casefold() not in names:
                 what = f"no {name}" if self._computed else f"neither {schema.REWARD} nor {name}"

@@ -33,8 +33,12 @@ def later_logs(
     except InputError:
         files, mapping = dataset.resolve(paths, stated.over(LogMapping(remembered.columns)))
     columns = {name: text for name, text in mapping.columns.items() if name not in stated.columns}
-    tables = {name: getattr(mapping, name) for name in ("item_features", "user_features")}
-    return files, replace(stated, **tables, remembered=LogMapping(columns))
+    return files, replace(
+        stated,
+        item_features=mapping.item_features,
+        user_features=mapping.user_features,
+        remembered=LogMapping(columns),
+    )
 
 
 def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:

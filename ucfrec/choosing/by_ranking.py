@@ -280,7 +280,8 @@ def measure_ranking(
             places = (values > logged_score).sum(1) + 1
             is_hit = (places <= SHOWN) & ~logged_score.isneginf()[:, 0]
             gains[number, part] = (is_hit / torch.log2(places + 1.0)).numpy()
-    hits, ndcg = (gains > 0).mean(1), gains.mean(1)
+    hits = (gains > 0).mean(1)
+    ndcg = gains.mean(1)
     return RankingReport(
         rows=len(steps),
         hits=float(hits[0]),

@@ -292,7 +292,7 @@ class ItemKNNPolicy(ScoringPolicy):
         scores = self.similarity(shown.items, shown.rewards)
         of_shown = scores.gather(1, items).mean()
         bias = self.head.get_parameter("bias").detach()
-        seen = torch.zeros(len(scores), len(bias) + 1, dtype=torch.bool, device=bias.device)
+        seen = scores.new_zeros(len(scores), len(bias) + 1, dtype=torch.bool)
         seen = seen.scatter_(1, shown.items % seen.shape[1], True)[:, :-1]  # the last is for none
         if not seen.gather(1, items).any():  # sessions in which no item is shown twice
             bias = bias.where(~seen, -torch.inf)
@@ -357,7 +357,8 @@ class BoostedPolicy(ScoringPolicy):
 
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        n_items, splits = sizes["items"], (TREES, _SPLITS)
+        n_items = sizes["items"]
+        splits = (TREES, _SPLITS)
         self._context = 3 * sizes["action"] + 2  # where features of users begin in `ItemStates`
         for name, value in (
             ("reward_low", torch.zeros(())),

@@ -172,7 +172,8 @@ def _describe(errors: Sequence[Any]) -> str:
     where = ".".join(map(str, places[0])) or "the request"
     more = len(set(places)) - 1
     same = zip(errors, places, strict=True)
-    messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
+    texts = (e["msg"] for e, place in same if place == places[0])
+    messages = dict.fromkeys(map(_uncapitalise, texts))
     value = first.get("input")
     actual = "" if isinstance(value, dict | list) else f", not {json.dumps(value, default=str):.60}"
     return (

@@ -373,8 +373,7 @@ class Served:
                 arm.responder.close()
 
     def _current(self) -> tuple[Promoted, int]:
-        """What the pointer file says, and when it was written: a run is tried again once it is
-        promoted again."""
+        """What the pointer says, and when it was written: a run promoted again is tried again."""
         pointer = promoted(self._folder)
         if pointer is None:
             raise InputError(

@@ -113,8 +113,9 @@ def test_options_stand_anywhere(line: str) -> None:
     named = [options.get("run"), *options.get("runs", []), *options.get("logs", [])]
     assert [str(one) for one in named if one is not None] == ["run", "logs"]
     assert "F" in map(str, options.values()) or options.get("k") == 3 or options["env"] == "E"
-    with pytest.raises(SystemExit):
-        parse_command(UCFREC, [*words, "--no-such-option"])
+    for wrong in ("--no-such-option", "--memory=800MB"):  # --memory-limit is not abbreviated
+        with pytest.raises(SystemExit):
+            parse_command(UCFREC, [*words, wrong])
 
 
 @pytest.fixture(scope="module")

@@ -81,15 +81,17 @@ def test_clocks_that_differ_do_not_split_sessions(tmp_path: Path, skew: int) -> 
     assert EpisodeStore.open(tmp_path / "store").lengths.tolist() == [3, 2] * 20
 
 
+@pytest.mark.filterwarnings("error:.*as bots have")  # only beside the single rows held out
 @pytest.mark.parametrize("last", [1, 3])
 def test_the_last_rows_of_every_user_test(tmp_path: Path, last: int) -> None:
     rng = np.random.default_rng(0)
-    parts = {"user_id": rng.integers(40, size=300), "item_id": rng.integers(9, size=300)}
-    times = START + 60_000 * rng.permutation(300)
-    log = pd.DataFrame({**parts, "timestamp": times, "reward": rng.random(300)})
+    users = np.concatenate([rng.integers(40, size=300), np.zeros(200, dtype=int)])
+    parts = {"user_id": users, "item_id": rng.integers(9, size=500)}
+    times = START + 60_000 * rng.permutation(500)
+    log = pd.DataFrame({**parts, "timestamp": times, "reward": rng.random(500)})
     log.to_parquet(tmp_path / "log.parquet")
-    name = "out" if last == 1 else str(last)
-    options = PrepareOptions(session_by="user", split=parse_split(f"leave-last-{name}"))
+    split = parse_split(f"leave-last-{'out' if last == 1 else last}")
+    options = PrepareOptions(session_by="user", split=split)
     prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
     found = EpisodeStore.open(tmp_path / "store").to_frame().sort_values(["user_id", "timestamp"])
     of_user = log.sort_values(["user_id", "timestamp"]).groupby("user_id").item_id

@@ -14,6 +14,7 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.baselines import (
     _PENALTY,
     BoostedPolicy,
@@ -59,8 +60,8 @@ def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])
 def test_drift_shortens_half_lives(tmp_path: Path, kind: type[RecentRatePolicy]) -> None:
     for drifts in (False, True):
-        (tmp_path / str(drifts)).mkdir()
-        store = drifting_store(tmp_path / str(drifts), drifts)
+        (folder := tmp_path / str(drifts)).mkdir()
+        store = drifting_store(folder, drifts)
         mixture = kind.choose_mixture(store.split("train"), store.split("validation"))
         short = mixture[torch.tensor(HALF_LIVES_OF_DEMAND) <= 24].sum()
         assert short > 0.2 if drifts else short < 0.01
@@ -146,8 +147,7 @@ def test_a_row_does_not_tell_the_trees_what_they_predict(
     """The rate of an item is the same in a fold whether the row itself was liked or not."""
     policy, store = fitted
     inputs, liked = policy._training_rows(store, np.arange(store.n_steps))
-    episodes, _ = store.all_steps()
-    items = store.column("item")
+    episodes, items = store.all_steps()[0], store.column("item")
     for item in range(3):
         rows = (items == item) & (episodes % 5 == 0)
         assert len(np.unique(inputs[rows, 0])) == 1
@@ -156,10 +156,8 @@ def test_a_row_does_not_tell_the_trees_what_they_predict(
 
 def test_effects_of_pairs_are_a_ridge_regression_on_other_folds() -> None:
     """Where every fold has all pairs of two user attributes and six items equally often."""
-    rng, tags = (
-        np.random.default_rng(0),
-        np.array([[0, -1], [1, -1], [0, 1], [2, 0], [-1, -1], [2, 1]]),
-    )
+    rng = np.random.default_rng(0)
+    tags = np.array([[0, -1], [1, -1], [0, 1], [2, 0], [-1, -1], [2, 1]])
     kinds, items, folds = (values.ravel() for values in np.indices((2, 6, 5)).repeat(40, axis=1))
     context = np.column_stack([np.ones(len(kinds)), 2.0 * kinds - 1])
     has_tag = (tags[:, :, None] == np.arange(3)).any(axis=1)
@@ -185,34 +183,42 @@ def attribute_store(folder: Path, effect: float) -> EpisodeStore:
     users = pd.DataFrame({"user_id": range(1000), "group": names})
     items = pd.DataFrame({"item_id": range(30), "tags": [[name] for name in names[:30]]})
     tables = []
-    for frame in (users, items):
-        frame.to_parquet(folder / f"{frame.columns[0]}.parquet")
-        tables.append((FeatureTable((folder / f"{frame.columns[0]}.parquet",), frame.columns[0]),))
+    for key, frame in (("user_id", users), ("item_id", items)):
+        frame.to_parquet(folder / f"{key}.parquet")
+        tables.append((FeatureTable((folder / f"{key}.parquet",), key),))
     mapping = LogMapping(user_features=tables[0], item_features=tables[1])
     options = {"session_by": "user", "embedding_size": 4, "split": (0.5, 0.4, 0.1)}
     return store_of(log, folder, mapping, reward="reward", **options)
 
 
-def fit_boosted(store: EpisodeStore) -> BoostedPolicy:
+def fit_solved(store: EpisodeStore, name: str = "boosted") -> SequencePolicy:
     train = store.split("train")
-    policy = new_policy(train, resolve_config("boosted", None, {"policy.context": 4})).eval()
+    policy = new_policy(train, resolve_config(name, None, {"policy.context": 4})).eval()
     policy.start_from(train)
     policy.make_solver(train, store.split("validation"), Path(), 0)()
     return policy
 
 
+def test_neighbours_count_where_sessions_show_no_item_twice(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    items = [rng.permutation(5)[:4] + 5 * rng.integers(4) for _ in range(300)]  # of four kinds
+    log = pd.DataFrame({"user_id": np.arange(1200) // 4, "item_id": np.concatenate(items)})
+    log = log.assign(reward=1.0, timestamp=1_700_000_000_000 + 60_000 * np.arange(1200))
+    store = store_of(log, tmp_path, reward="reward", session_by="user")
+    assert fit_solved(store, "item-knn").temperature > 4  # 2.3 if it could show items again
+
+
 def test_users_with_an_attribute_get_items_with_the_tag_they_like(tmp_path: Path) -> None:
     store = attribute_store(tmp_path, effect=0.25)
-    policy, test = fit_boosted(store), store.split("test")
+    policy, test = fit_solved(store), store.split("test")
     episodes = np.arange(test.n_episodes)
     windows = test.windows(episodes, np.zeros_like(episodes), 4)  # without history
     scores, group = policy.act(windows), windows.states[:, -1, -1].numpy() > 0
     tagged = store.item_states.tags[:, 0] == 0
     gain = (scores[:, tagged].mean(1) - scores[:, ~tagged].mean(1)).numpy()
     shown, rewards = tagged.numpy()[test.column("item")], test.column("reward")
-    of_rows = group[test.all_steps()[0]]
     for value in (False, True):
-        rows = of_rows == value
+        rows = group[test.all_steps()[0]] == value
         liked = rewards[rows & shown].mean() - rewards[rows & ~shown].mean()
         assert (np.sign(liked) * gain[group == value]).min() > 0.5
 
@@ -222,13 +228,12 @@ def test_noise_grows_few_trees_and_a_refit_keeps_their_number(tmp_path: Path) ->
     for effect in (0.0, 0.25):
         (tmp_path / str(effect)).mkdir()
         store = attribute_store(tmp_path / str(effect), effect)
-        policy = fit_boosted(store)
+        policy = fit_solved(store)
         numbers.append(int(policy.trees))
-        refit = new_policy(
-            store.split("train"), resolve_config("boosted", None, {"policy.context": 4})
-        )
-        refit.start_from(store.split("train"))
+        train = store.split("train")
+        refit = new_policy(train, resolve_config("boosted", None, {"policy.context": 4}))
+        refit.start_from(train)
         refit.trees.copy_(policy.trees)
-        refit.make_solver(store.split("train"), None, Path(), 0)()
+        refit.make_solver(train, None, Path(), 0)()
         torch.testing.assert_close(refit.state_dict(), policy.state_dict())
     assert numbers[0] < 10 < numbers[1]

@@ -428,15 +428,12 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     "split is 0.8; give three shares, two": lambda p, log: p.fit(log, split=0.8),
     "split '1,x': write shares as .* ISO": lambda p, log: p.fit(log, split=(1, "x")),
     "reward is 1; give text": lambda p, log: p.fit(log, reward=1),
+    "name it with reward, or give reward='1' if": lambda p, log: p.fit(log.iloc[:, :3]),
     "on_step is 3; give a function": lambda p, log: p.fit(log, on_step=3),
     "out is 3; give a path": lambda p, log: p.fit(log, 3),
-    "mapping is {'user_id': 3}; give a LogMapping, a TOML file, or a dic": (
-        lambda p, log: p.fit(log, mapping={"user_id": 3})
-    ),
+    "{'user_id': 3}; give a LogMapping, a": lambda p, log: p.fit(log, mapping={"user_id": 3}),
     "takes a list of FeatureTable": lambda _, log: LogMapping(item_features=[log]),
-    "give log files, folders or globs here, and frames to Recommender.fit": (
-        lambda _, log: prepare(log, LogMapping(), "store")
-    ),
+    "here, and frames to Recommender.fit": lambda _, log: prepare(log, LogMapping(), "store"),
     "run is None; give a path": lambda *_: Recommender.load(None),
     "environment is None; give the name of a": lambda p, _: p.evaluate(None),
     "episodes is '50'; give a whole number, 1 or more": lambda p, _: p.evaluate(SIM, "50"),
@@ -444,14 +441,10 @@ WRONG: dict[str, Callable[[Recommender, pd.DataFrame], object]] = {
     "window_days is '3'; give a finite": lambda p, log: p.update(log, "no", window_days="3"),
     f"logs is None; {FRAME}": lambda p, _: p.score(None),
     "rule is 'greedy'; give a De": lambda p, log: p.recommend(log, rule="greedy"),
-    r"options is {'discount': 0\.9}; give EstimateOptions": (
-        lambda p, log: p.ope(log, options={"discount": 0.9})
-    ),
+    "; give EstimateOptions": lambda p, log: p.ope(log, options={"discount": 0.9}),
     "^data: the logs are of one user": lambda p, log: p.ope(log[log.user_id == 7]),
     "others has 'run'; give a Rec": lambda p, log: p.rank(log, others=["run"]),
-    "candidates is empty or nested; give a list of item_ids, or None for all": (
-        lambda p, log: p.recommend(log, candidates=[[1], [2, 3]])
-    ),
+    "candidates is empty or nested": lambda p, log: p.recommend(log, candidates=[[1], [2, 3]]),
 }
 """What is said of a call."""
 

@@ -143,8 +143,7 @@ def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
     goes_on, begins = (recommended(trained, log, 24, new_session=new) for new in (False, True))
     for request, found in zip(asked, by.answers([Request(**r) for r in asked]), strict=True):
         same, other = (begins, goes_on) if request["new_session"] else (goes_on, begins)
-        user = request["user_id"]
-        scores = [each[each.user_id == user].score.to_numpy() for each in (same, other)]
+        scores = [f[f.user_id == request["user_id"]].score.to_numpy() for f in (same, other)]
         np.testing.assert_allclose(found.scores, scores[0], rtol=1e-5, atol=1e-6)
         assert not np.allclose(*scores, rtol=1e-3)
 
@@ -216,6 +215,7 @@ REVENUE = "coalesce(revenue, 0) + 1"
         ("click", ANY_CASE, [1, 2, 3], {"clicks": 1}, "neither reward nor click"),
         ("1 * click", ANY_CASE, [1, 2, 3], {"clicks": 1}, "neither reward nor click"),
         ("1 - reward / 5", [{"reward": 5.0}], [0], {"clicks": 1}, "history has no reward, which"),
+        ("1", [{"item_id": 5}, {"click": 2}, {}], [1, 1, 1], {"reward": "3"}, "the reward is '3'"),
     ],
 )
 def test_rewards_are_computed_from_feedback(

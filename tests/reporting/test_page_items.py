@@ -103,13 +103,13 @@ def test_samples_are_what_the_policy_shows(folder: Path, tmp_path: Path) -> None
 
 def test_features_come_beside_samples_and_never_run(folder: Path, tmp_path: Path) -> None:
     features = tmp_path / "features.csv"
-    rows = [f'item {n},"{HOSTILE}",{n % 2}' for n in range(N_ITEMS)]
+    rows = [f'item {n},"{HOSTILE}",{n % 2 * 2026}' for n in range(N_ITEMS)]
     rows = [row.replace('"alert(2)"', "2") for row in rows]
     features.write_text("\n".join(["item_id,title,fresh", *rows]))
     out = tmp_path / "report.html"
     assert main(["report", str(folder / "ucf"), "--items", str(features), "--out", str(out)]) == 0
     page = out.read_text()
-    assert all(text in page for text in ("&lt;script&gt;", "fresh 1"))
+    assert all(text in page for text in ("&lt;script&gt;", "fresh 2026"))
     assert not any(text in page for text in ("<script", "fresh 0"))
     features.write_text("id\n1\n")
     unread = folder / "ucf" / "run.json"

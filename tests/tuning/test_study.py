@@ -65,10 +65,9 @@ def test_the_best_trial_is_the_run_that_is_kept(store: Path, tmp_path: Path) -> 
     searched = plan(store, tmp_path / "tuned", ("dt", "item-rate"), "ndcg")
     study = tune(searched, 4)
     assert len(list_finished(study)) == 4
-    best = searched.out / BEST
     left = {path.name for path in searched.out.iterdir()}
     assert left == {BEST, "best.toml", "tuning.md", "study.db", "stages"}
-    trained = TrainedPolicy.load(best)
+    trained = TrainedPolicy.load(searched.out / BEST)
     assert measure_run(trained, EpisodeStore.open(store), "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
@@ -87,8 +86,7 @@ def test_a_search_goes_on_and_gives_the_same_trials(store: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
-    study = tune(plan(store, tmp_path / "tuned"), 4, workers=2)
-    assert len(list_finished(study)) == 4
+    assert len(list_finished(tune(plan(store, tmp_path / "tuned"), 4, workers=2))) == 4
     assert (tmp_path / "tuned" / BEST / RunRecord.FILE).exists()
 
 
@@ -100,8 +98,7 @@ def test_a_killed_trial_is_run_again_in_a_folder_of_any_name(store: Path, tmp_pa
     alter(searched, "UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
     alter(searched, "DELETE FROM trial_values")
     resumed = tune(searched, 1)
-    states = [trial.state.name for trial in resumed.trials]
-    assert states == ["FAIL", "COMPLETE"]
+    assert [trial.state.name for trial in resumed.trials] == ["FAIL", "COMPLETE"]
     assert resumed.trials[0].params == resumed.trials[1].params
     alter(searched, "UPDATE trials SET state = 'LOST'")
     with pytest.raises(InputError, match=r"study\.db is damaged \(LookupError: 'LOST' is not"):
@@ -114,7 +111,7 @@ def test_a_killed_trial_is_run_again_in_a_folder_of_any_name(store: Path, tmp_pa
 def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
     rates = {"train.learning_rate": Dimension((0.03, 1e-6))}
     rates["policy.dropout"] = Dimension(low=0.0, high=0.5)
-    fixed = {**FIXED, "train.steps": 12, "policy.dim": 8, "rule.choose": False}
+    fixed = FIXED | {"train.steps": 12, "policy.dim": 8, "rule.choose": False}
     search = Search(("dt",), fixed, False, 0, rates)
     study = tune(Plan(store, tmp_path / "tuned", search, "gauc", 5), 9)
     ended = [trial for trial in study.trials if trial.state.name == "PRUNED"]
@@ -134,15 +131,11 @@ def test_the_command_writes_settings_that_train_takes(
     space = tmp_path / "space.toml"
     space.write_text("[train]\nsteps = [2, 3]\n[policy]\ndropout = {low = 0.0, high = 0.2}\n")
     fixed = [f"--set={name}={value}" for name, value in FIXED.items()]
-    out = tmp_path / "tuned"
-    given = ["tune", str(store), "--out", str(out), "--policy", "dt", "--trials", "4"]
-    assert main([*given, "--space", str(space), *fixed, "--set", "policy.dim=8"]) == 0
-    printed = capsys.readouterr().out
-    assert "next: ucfrec ope" in printed
-    settings = tomllib.loads((out / "best.toml").read_text(encoding="utf-8"))
-    assert settings["policy"]["dim"] == 8
-    config = resolve_config("dt", out / "best.toml")
-    assert config == RunRecord.read(out / BEST).config
+    out, more = tmp_path / "tuned", [*fixed, "--set", "policy.dim=8", "--space", str(space)]
+    assert main(f"tune {store} --out {out} --policy dt --trials 4".split() + more) == 0
+    assert "next: ucfrec ope" in capsys.readouterr().out
+    assert tomllib.loads((out / "best.toml").read_text("utf-8"))["policy"]["dim"] == 8
+    assert resolve_config("dt", out / "best.toml") == RunRecord.read(out / BEST).config
     assert (out / "tuning.md").read_text(encoding="utf-8").count("\n| ") >= 4
 
 
@@ -160,7 +153,15 @@ def test_what_cannot_be_searched(store: Path, tmp_path: Path) -> None:
             Dimension(**values_of)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="0 trials and 1 workers"):
         tune(plan(store, tmp_path / "tuned"), 0)
-    unchosen = Search(("item-rate",), {"rule.choose": False}, True, 0)
-    with pytest.raises(InputError, match=r"item-rate has no estimated value.*use --metric ndcg"):
-        tune(Plan(store, tmp_path / "tuned", unchosen), 1)
+    store_of(random_log().assign(reward=1.0), tmp_path, session_by="gap", gap_minutes=20)
+    for choose, of in ((False, store), (True, tmp_path / "store")):
+        search = Search(("item-rate",), {"rule.choose": choose}, True, 0)
+        with pytest.raises(InputError, match=r"item-rate has no estimated value.*--metric ndcg"):
+            tune(Plan(of, tmp_path / "tuned", search), 1)
     assert not (tmp_path / "tuned").exists()
+    # Nothing is proposed that needs rewards that differ.
+    search = Search(("dt",), FIXED | {"train.steps": 2, "policy.dim": 4}, False, 0)
+    study = tune(Plan(tmp_path / "store", tmp_path / "tuned", search, "ndcg"), 2)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
+    best = RunRecord.read(tmp_path / "tuned" / BEST).ranking
+    assert best.ndcg == pytest.approx(study.best_value)  # `train` measures it as `rank` does

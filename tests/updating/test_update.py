@@ -19,6 +19,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.logs.append import AppendOptions
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.runs.later_logs import later_logs
 from ucfrec.runs.promoted import promoted
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -53,11 +55,13 @@ def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None
 
 
 def test_the_updated_run_recommends_new_items(folder: Path) -> None:
-    assert TrainedPolicy.load(folder / "run2").item_ids.tolist() == list(range(ITEMS + NEW))
-    later_log().to_parquet(folder / "histories.parquet")
-    arguments = ["recommend", str(folder / "run2"), str(folder / "histories.parquet")]
-    out = folder / "out.parquet"
-    assert main([*arguments, "--k", "30", "--keep-seen", "--out", str(out)]) == 0
+    trained, log, items = (folder / name for name in ("run2", "histories.parquet", "items.parquet"))
+    assert TrainedPolicy.load(trained).item_ids.tolist() == list(range(ITEMS + NEW))
+    later_log().to_parquet(log)
+    named = f"{trained} {log} --k 30 --keep-seen --out {folder / 'out.parquet'}".split()
+    assert main(["recommend", *named]) == 0
+    files, mapping = later_logs(TrainedPolicy.load(trained), [log, items], LogMapping())
+    assert (files, mapping.item_features[0].files) == ((log,), (items,))  # as `prepare` reads them
 
 
 def test_an_update_of_an_update_has_the_settings_of_the_first_run(folder: Path) -> None:
@@ -85,8 +89,7 @@ def test_the_same_command_goes_on_and_another_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mapping = later_mapping(folder)
-    before = RunRecord.read(folder / "run2")
-    logs = [folder / "later.parquet"]
+    before, logs = RunRecord.read(folder / "run2"), [folder / "later.parquet"]
     again = update_run(folder / "run", logs, folder / "run2", mapping=mapping)
     assert (again.update, again.rule, again.policy) == (before.update, before.rule, before.policy)
     name = "policy/best.safetensors"
@@ -101,8 +104,7 @@ def test_the_same_command_goes_on_and_another_is_refused(
 def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:
     settings = [*SETTINGS, "augment.copies=1", "crm.epochs=12"]
     Recommender("ucf", settings).fit(EpisodeStore.open(folder / "store"), tmp_path / "run")
-    logs = [folder / "later.parquet"]
-    record = update_run(tmp_path / "run", logs, tmp_path / "run2")
+    record = update_run(tmp_path / "run", [folder / "later.parquet"], tmp_path / "run2")
     assert record.augmentation is not None
     assert record.config.crm.epochs == 1
     old = load_tensors(tmp_path / "run" / "crm" / "cvae" / "best.safetensors")[0]
@@ -162,12 +164,8 @@ def test_the_documented_night_runs_on_the_first_day(
     updated = "update runs log.parquet --mapping shop.toml --out runs/second"
     run(f"{updated} --window 60d")
     said = capsys.readouterr().out
-    for part in (
-        "new rows      60 of 60 read (0 not newer",
-        "of the new rows have new items, ",
-        "the old run's reward model predicts ",
-        "verdict ",
-    ):
+    assert "new rows      60 of 60 read (0 not newer" in said
+    for part in ("rows have new items, ", "the old run's reward model predicts ", "verdict "):
         assert part in said
     assert main([*updated.split(), "--window", "soon"]) == 2
     assert "--window soon is not a duration" in capsys.readouterr().err

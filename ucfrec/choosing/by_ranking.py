@@ -27,13 +27,14 @@ from ucfrec.choosing.choice import (
     RuleRecord,
 )
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.policies.baselines import RecentClicksPolicy
 from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import (
     draw_episodes,
+    draw_numbers,
     draw_steps,
     number_users,
     read_propensities,
@@ -256,17 +257,22 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 def measure_ranking(
     scorer: Scorer, train: EpisodeStore, validation: EpisodeStore, seed: int
 ) -> RankingReport:
-    """How the policy ranks validation rows, beside the items that are shown most of late."""
+    """How the policy ranks validation rows without what the user has seen, as `recommend` does,
+    beside the items that are shown most of late."""
 
     def shown(view: EpisodeStore, rewards: Array) -> BoolArray:
         return np.ones(len(rewards), dtype=bool)
 
-    episodes, steps = draw_steps(validation, _FEWEST_STEPS, seed)
+    numbers = draw_numbers(validation.n_steps, _FEWEST_STEPS, seed)
+    episodes, steps = validation.locate(numbers)
     logged = LoggedScores(scorer, validation, episodes, steps)
+    rows = UserRows.of(validation, number_users(validation), train)
     mixture = RecentClicksPolicy.choose_mixture(train, validation, shown)
     demand = RecentClicksPolicy.scores_of(train, mixture, shown)
     gains = np.zeros((2, len(steps)))
-    for part, _, scores in logged.score([replace(scorer.rule, exclude_seen=True)]):
+    for part, _, scores in logged.score([scorer.rule]):
+        scores = scores.clone()
+        scores[rows.seen(numbers[part])] = -torch.inf
         items = torch.from_numpy(logged.items[part]).unsqueeze(1)
         baseline = demand.masked_fill(scores.isneginf(), -torch.inf)
         for number, values in enumerate((scores, baseline)):
@@ -274,7 +280,8 @@ def measure_ranking(
             places = (values > logged_score).sum(1) + 1
             is_hit = (places <= SHOWN) & ~logged_score.isneginf()[:, 0]
             gains[number, part] = (is_hit / torch.log2(places + 1.0)).numpy()
-    hits, ndcg = (gains > 0).mean(1), gains.mean(1)
+    hits = (gains > 0).mean(1)
+    ndcg = gains.mean(1)
     return RankingReport(
         rows=len(steps),
         hits=float(hits[0]),

@@ -483,8 +483,7 @@ def _correct(simulated: Outcomes, logged: LoggedGains, weighted: bool = True) ->
 def choose_by_simulation(problem: Problem) -> RuleChoice:
     """Choose target, minimum target and temperature, then the reward weight, and what
     `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
-    Rules of the highest value are then simulated in more sessions. Of rules that the model cannot
-    distinguish, the log decides."""
+    The best rules are then simulated in more sessions; between equal ones, the log decides."""
     search, where = RuleSearch(problem), ""
     if (start := problem.start) is None:
         candidates = _search_all(search)

@@ -156,8 +156,7 @@ class RankedRule:
     """Difference of `hits` from the most liked items, or from those liked lately if better."""
     gain_error: float
     overlaps: bool
-    """Whether it finds liked items better than these, and `rule.keep_hits` of the hits that it has
-    without the reward model."""
+    """Whether it finds liked items better, and has `rule.keep_hits` of the policy's own hits."""
 
 
 class RuleRecord(Entry):

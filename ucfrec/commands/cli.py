@@ -177,8 +177,7 @@ def parse_command(
     program: Program, arguments: Sequence[str]
 ) -> tuple[type[Table], argparse.Namespace]:
     """The table of the called command and its options, which may stand before, between and after
-    runs and logs. Only its module is imported: those of all commands take seconds.
-    """
+    runs and logs. Only its module is imported: those of all commands take seconds."""
     lines = [program.summary]
     for name, summary in program.commands.items():
         lines += [f"\n{program.sections[name]}:"] if name in program.sections else []
@@ -201,6 +200,7 @@ def parse_command(
         description=summary,
         formatter_class=_Formatter,
         add_help=False,
+        allow_abbrev=False,  # `--exclude FILE` would be `--exclude-seen`, and the file a log
     )
     package = import_module(f"{program.package}.{module or called.command}")
     table: type[Table] = getattr(package, called.command.capitalize())

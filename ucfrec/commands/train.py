@@ -169,12 +169,12 @@ class Tune(Table):
         )
         plan = Plan(self.store, self.out, search, self.metric, self.k, not self.no_pruning)
         tune(plan, self.trials, self.workers)
+        measure = "ope" if self.metric == "value" else "rank"
         print((self.out / BEST_TOML).read_text(encoding="utf-8"))
         print(
             f"selected on validation rows; settings: {self.out / BEST_TOML}\n"
             f"all trials and the importance of settings: {self.out / PAGE}\n"
-            f"next: ucfrec ope {quote(str(self.out / BEST))}, its value on the test split, which "
-            "no trial has seen"
+            f"next: ucfrec {measure} {quote(str(self.out / BEST))}, on the unseen test split"
         )
 
 

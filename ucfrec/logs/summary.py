@@ -222,8 +222,7 @@ def note_unknown(
     total: int,
     known_ids: str,
 ) -> None:
-    """Warn where nearly all of many users or items of a log are not among those of, say, a store
-    (`known_ids`), as if written in another way."""
+    """Warn if nearly all of many ids of a log are not `known_ids`, as if written in another way."""
     if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
         return
     ids = column.removesuffix("_id") + "s"
@@ -308,7 +307,8 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
             "between; check --column item_id and --where",
         )
-    (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES}")
+    # Of training, because held-out episodes may be the last row of each user.
+    (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES} WHERE split = 0")
     longest = rows.log.connection.sql(
         f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
         f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"

@@ -17,7 +17,7 @@ from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown, Windows
 from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, standardise
-from ucfrec.policies.heads import ItemHead, VectorHead
+from ucfrec.policies.heads import VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
 from ucfrec.user_model.reward_report import draw_numbers
@@ -96,8 +96,7 @@ class PopularPolicy(ScoringPolicy):
 
     The score is the logarithm of the item's share of all `steps`, one step added to each item; the
     logarithm of its share of the `likes`; or the log-odds of its `rate` of liked steps. For action
-    vectors, it is the mean logged action. Only an exposure term is learned by gradient, and only by
-    shares of steps.
+    vectors, it is the mean logged action. With `steps`, an exposure term is learned by gradient.
 
     Where recent rows count more, a row that is h half-lives older than the last training row counts
     2^−h; rates have one half-life, shares of likes are a mixture of those of several.
@@ -231,7 +230,7 @@ class ItemKNNPolicy(ScoringPolicy):
 
     Cosines are between columns of the session × item matrix of rewards minus the lowest reward.
     A bias per item, the log of its share of the training steps, is added to the cosines times a
-    temperature, which is chosen on held-out steps. States and returns are not used.
+    temperature, chosen on held-out steps. States and returns are not used.
     """
 
     Config = ItemKNNConfig
@@ -253,8 +252,7 @@ class ItemKNNPolicy(ScoringPolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Find the neighbours of every item; an item is a neighbour of itself."""
-        # Imported here because loading a trained policy does not need scipy.
-        from scipy import sparse
+        from scipy import sparse  # here, because loading a trained policy does not need it
 
         episodes, steps = train.all_steps()
         items = train.step_values(schema.ITEM, episodes, steps)
@@ -288,16 +286,21 @@ class ItemKNNPolicy(ScoringPolicy):
         """Minimise the negative log-likelihood, convex in the temperature, by bisection."""
         numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
         episodes, steps = held_out.locate(numbers)
-        windows = held_out.windows(episodes, steps, self.config.context)
-        windows = windows.to(self.cosines.device)
-        shown, items = Shown.before_last(windows), windows.actions[:, -1:]
+        windows = held_out.windows(episodes, steps, self.config.context).to(self.cosines.device)
+        shown = Shown.before_last(windows)
+        items = windows.actions[:, -1:]
         scores = self.similarity(shown.items, shown.rewards)
         of_shown = scores.gather(1, items).mean()
-        assert isinstance(self.head, ItemHead)
-        low, high = 0.0, _HOTTEST
+        bias = self.head.get_parameter("bias").detach()
+        seen = scores.new_zeros(len(scores), len(bias) + 1, dtype=torch.bool)
+        seen = seen.scatter_(1, shown.items % seen.shape[1], True)[:, :-1]  # the last is for none
+        if not seen.gather(1, items).any():  # sessions in which no item is shown twice
+            bias = bias.where(~seen, -torch.inf)
+        low = 0.0
+        high = _HOTTEST
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            expected = (middle * scores + self.head.bias).softmax(-1).mul(scores).sum(-1).mean()
+            expected = (middle * scores + bias).softmax(-1).mul(scores).sum(-1).mean()
             low, high = (low, middle) if expected > of_shown else (middle, high)
         self.temperature.fill_((low + high) / 2)
 
@@ -354,7 +357,8 @@ class BoostedPolicy(ScoringPolicy):
 
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        n_items, splits = sizes["items"], (TREES, _SPLITS)
+        n_items = sizes["items"]
+        splits = (TREES, _SPLITS)
         self._context = 3 * sizes["action"] + 2  # where features of users begin in `ItemStates`
         for name, value in (
             ("reward_low", torch.zeros(())),

@@ -68,8 +68,7 @@ class CRMGreedyPolicy(SequencePolicy):
         folder: Path,
         seed: int,
     ) -> Callable[[], None] | None:
-        """For items, fits the reward model; its effects are chosen on a tenth of the episodes if
-        none are held out."""
+        """For items, fits the reward model, on nine tenths of the episodes if none are held out."""
         model = self.model
         if not isinstance(model, ItemRewardModel):
             return None

@@ -68,8 +68,7 @@ class VectorHead(nn.Module):
         actions: Tensor,
         exposed: Exposed | None = None,
     ) -> Tensor:
-        """The mean squared error (M,) of each of M steps in units of `scale`, from features (M, d)
-        and actions (M, A)."""
+        """Mean squared errors (M,), in units of `scale`, by features (M, d) and actions (M, A)."""
         error = (self.predict(features) - actions) / self.scale
         return error.square().mean(-1)
 

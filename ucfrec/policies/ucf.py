@@ -243,8 +243,7 @@ class Dropout(nn.Dropout):
 
 
 def draw_mask(shape: torch.Size, p: float) -> Tensor:
-    """Independent draws, float32 on the CPU: 0 with probability p, rounded to a multiple of 2⁻¹⁶,
-    otherwise 1 / (1 − p)."""
+    """Float32 draws on the CPU: 0 with probability p (in multiples of 2⁻¹⁶), else 1 / (1 − p)."""
     dropped = round(p * _LEVELS)
     if dropped == _LEVELS:
         return torch.zeros(shape)

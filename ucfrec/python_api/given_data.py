@@ -48,8 +48,8 @@ _OPTIONS = (
     (r"--earliest ([\d-]+)", r"mapping=LogMapping(earliest='\1')"),
     (r"--time-format", "LogMapping.time_format"),
     (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
-    (r"--liked", "liked"),
-    (r"--k\b", "k"),
+    (r"--reward 1\b", "reward='1'"),
+    (r"--(reward|liked|k)(?![\w-])", r"\1"),
     (r" with --out", ""),
     (r"--policy ([\w-]+)", r"policy='\1'"),
 )

@@ -53,8 +53,7 @@ _TYPES = ("constrained-str", "float", "constrained-int", "int", "str")
 _ROWS = "history"
 """Name of the rows in messages and in the engine."""
 _MEMORY = "512MB"
-"""Of which the engine may take half: a request is some megabytes, and no expression makes much more
-of it."""
+"""Half of it is the engine's: a request has some megabytes, and no expression needs much more."""
 
 
 TIME_FORMS = "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
@@ -137,8 +136,7 @@ class StreamRequest(Request):
     """A request of a stream, which remembers its users."""
 
     interactions: Annotated[list[Row], Field(fail_fast=True)] = []
-    """Rows that are added to the history or, without one, to what the stream has had of the
-    user."""
+    """Rows after the history or, without one, after what the stream has had of the user."""
 
 
 def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
@@ -174,7 +172,8 @@ def _describe(errors: Sequence[Any]) -> str:
     where = ".".join(map(str, places[0])) or "the request"
     more = len(set(places)) - 1
     same = zip(errors, places, strict=True)
-    messages = dict.fromkeys(_uncapitalise(e["msg"]) for e, place in same if place == places[0])
+    texts = (e["msg"] for e, place in same if place == places[0])
+    messages = dict.fromkeys(map(_uncapitalise, texts))
     value = first.get("input")
     actual = "" if isinstance(value, dict | list) else f", not {json.dumps(value, default=str):.60}"
     return (
@@ -197,7 +196,8 @@ class RowRewards:
     """
 
     def __init__(self, expression: Expression) -> None:
-        self._expression, self._computed = expression, computes_with_reward(expression)
+        self._expression = expression
+        self._computed = computes_with_reward(expression)
         self._stack = ExitStack()
         self.close = self._stack.close
         """Close the engine."""
@@ -220,8 +220,10 @@ class RowRewards:
         return _require_numbers(self._evaluate(rows), "no reward")
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        connection, source = self._connection, Path(_ROWS)
-        names, columns = {name.casefold() for row in rows for name in row}, {}
+        connection = self._connection
+        source = Path(_ROWS)
+        names = {name.casefold() for row in rows for name in row}
+        columns: dict[str, Any] = {}
         for name in columns_of(connection, self._expression):
             if name.casefold() not in names:
                 what = f"no {name}" if self._computed else f"neither {schema.REWARD} nor {name}"
@@ -236,7 +238,7 @@ class RowRewards:
                 raise InputError(
                     f"history: {name} has values of several types ({reason})"
                 ) from None
-        connection.register(_ROWS, pa.table(columns))
+        connection.register(_ROWS, pa.table(columns or {_ROWS: [0] * len(rows)}))  # a constant
         described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
         table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
         try:

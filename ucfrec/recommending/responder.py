@@ -181,8 +181,7 @@ class Responder:
         self._reader.rewards.close()
 
     def answers(self, requests: Sequence[Request]) -> list[Answer | InputError]:
-        """Answer requests with as few forward passes as memory allows: to each, in their order, the
-        answer, or what is wrong with it."""
+        """The answers, or what is wrong, in as few forward passes as memory allows, in order."""
         outcomes = [self._read_or_refuse(request) for request in requests]
         questions = [question for question in outcomes if isinstance(question, _Question)]
         answers = self._answer(questions) if questions else iter(())
@@ -348,8 +347,7 @@ class Served:
         return self._arms[0].responder.drift()
 
     def check(self) -> None:
-        """Answer with the current run from now on, if it is another one and passes a trial;
-        InputError if none is current."""
+        """Change to the current run if it passes a trial; InputError if none is current."""
         current = self._current()
         if current == self._known:
             return
@@ -375,8 +373,7 @@ class Served:
                 arm.responder.close()
 
     def _current(self) -> tuple[Promoted, int]:
-        """What the pointer file says, and when it was written: a run is tried again once it is
-        promoted again."""
+        """What the pointer says, and when it was written: a run promoted again is tried again."""
         pointer = promoted(self._folder)
         if pointer is None:
             raise InputError(

@@ -55,11 +55,12 @@ def features_by_id(features: pa.Table | None) -> Features:
 
 def describe_features(features: Mapping[str, Any]) -> str:
     """Text of the features that are neither missing nor zero, cut to `_MOST_CHARACTERS`."""
-    parts = (
-        f"{name} {', '.join(map(format_value, value if isinstance(value, list) else [value]))}"
-        for name, value in features.items()
-        if value
-    )
+    parts = []
+    for name, value in features.items():
+        values = value if isinstance(value, list) else [value]
+        texts = (str(v) if type(v) is int else format_value(v) for v in values)  # of 2026, a year
+        if value:
+            parts.append(f"{name} {', '.join(texts)}")
     text = "; ".join(parts)
     return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 1]}…"
 

@@ -16,8 +16,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 def later_logs(
     trained: TrainedPolicy, paths: Sequence[str | Path], stated: LogMapping
 ) -> tuple[tuple[Path, ...], LogMapping]:
-    """Log files of the dataset that a policy was trained on, whose columns may have plain names.
-    InputError if a path is missing, or holds no log of the dataset.
+    """Log files of the dataset that a policy was trained on, whose columns may have plain names,
+    with its feature tables. InputError if a path is missing, or holds no log of the dataset.
 
     Args:
         paths: files, folders and globs.
@@ -33,7 +33,12 @@ def later_logs(
     except InputError:
         files, mapping = dataset.resolve(paths, stated.over(LogMapping(remembered.columns)))
     columns = {name: text for name, text in mapping.columns.items() if name not in stated.columns}
-    return files, replace(stated, remembered=LogMapping(columns))
+    return files, replace(
+        stated,
+        item_features=mapping.item_features,
+        user_features=mapping.user_features,
+        remembered=LogMapping(columns),
+    )
 
 
 def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:

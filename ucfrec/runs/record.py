@@ -287,8 +287,7 @@ class RunRecord(TrainingRecord):
 
 
 def read_record(run: Path) -> RunRecord:
-    """The record of a run, whose small files are compared with their checksums; InputError if it is
-    damaged, or no run folder."""
+    """The record of a run, its small files verified; InputError if damaged, or no run folder."""
     record = RunRecord.read(run)
     record.require(run, small=SMALL)
     return record
@@ -307,15 +306,13 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:
-    """The decision rules that the choice of a run tried; none if it did not choose. InputError if
-    they are damaged."""
+    """The decision rules that the choice of a run tried, if any. InputError if they are damaged."""
     path = run / CANDIDATES
     return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
 
 
 def read_augmentation(path: Path) -> AugmentationReport:
-    """The report of an augmentation that is made, of a run that may still be in training;
-    InputError if it is damaged."""
+    """The report of an augmentation, even during training; InputError if it is damaged."""
     return _read_stage(path, AugmentationReport)
 
 

@@ -213,8 +213,7 @@ def _mean_loss(view: EpisodeStore, scores: Tensor, counts: Tensor) -> float:
 
 
 def _sample_offers(view: EpisodeStore) -> Iterator[tuple[Offer | None, Tensor]]:
-    """What was on offer at steps of the view, evenly spaced if they are many, and the items shown,
-    some steps at a time."""
+    """Offers and shown items of steps of the view, some at a time, evenly spaced if many."""
     n_items = len(view.item_states.embeddings)
     numbers = np.arange(0, view.n_steps, -(-view.n_steps * n_items // _OFFERED) or 1)
     for part in np.array_split(numbers, -(-len(numbers) * n_items // _AT_ONCE) or 1):

@@ -205,8 +205,7 @@ class TrainedPolicy:
         return store
 
     def target_return(self, quantile: float) -> float:
-        """The `quantile` of `training_returns`, exact, in reward units; InputError if it is not
-        from 0 to 1."""
+        """The exact `quantile` (0 to 1, else InputError) of `training_returns`, in reward units."""
         if not 0 <= quantile <= 1:
             raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
@@ -295,8 +294,7 @@ class RunOnWorkers:
 
     @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:
-        """The policy, kept for the next task of this worker; InputError if the folder holds no or
-        another run."""
+        """The policy, kept for the worker's next task; InputError if the folder has no such run."""
         # A worker has one core; the cluster runs as many workers as it has cores.
         torch.set_num_threads(1)
         trained = TrainedPolicy.load(self.folder, self.checkpoint)

@@ -66,6 +66,8 @@ HISTORY: Space = {
 """Of those that read what was shown before, too."""
 NEIGHBORS: Space = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
 REWARD_WEIGHTS: Space = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0))}
+OF_REWARDS = {"augment.copies": 0, "augment.actions": 0, "rule.reward_weights": (0.0,)}
+"""Settings that act through a model of rewards, and their values where all rewards are equal."""
 
 
 def read_space(path: Path) -> Space:

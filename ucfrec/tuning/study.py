@@ -3,15 +3,15 @@ the best settings as TOML, and a page of all trials."""
 
 import json
 import math
-import shlex
 import shutil
 import sqlite3
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import continue_users
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.tuning.space import POLICY, Search
+from ucfrec.tuning.space import OF_REWARDS, POLICY, Search
 
 VALUE = "value"
 METRICS = {
@@ -52,8 +52,7 @@ _NO_VALUE = (
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
 _REMEDY = "restore it, or name another folder"
-_COMPARED = 4
-"""Earlier trials of the same policy from which on a trial may be ended early."""
+_COMPARED = 4  # earlier trials of the same policy, from which on a trial may be ended early
 
 
 def measure_run(
@@ -105,17 +104,19 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
     """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
-    settings, `tuning.md` all trials. InputError if the folder holds another search, the numbers are
-    out of range, the policies have no such metric on this store, no trial could be measured, or the
-    study's file is damaged or cannot be written.
+    settings, `tuning.md` all trials. InputError if the folder holds another search, numbers are out
+    of range, a policy has no such metric here, no trial has a value, or the study is damaged.
     """
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
-    store = EpisodeStore.open(plan.store)
-    for policy in plan.search.policies if plan.metric == VALUE else ():
-        config = plan.search.config(policy, {})
+    store, search = EpisodeStore.open(plan.store), plan.search
+    are_equal = np.ptp(store.split("train").column(schema.REWARD)) == 0
+    if are_equal and search.own_space is None:
+        plan = replace(plan, search=replace(search, fixed=OF_REWARDS | dict(search.fixed)))
+    for policy in search.policies if plan.metric == VALUE else ():
+        config = search.config(policy, {})
         returns = config.policy.returns(store.record.source.session_by)
-        if not (store.has_items and config.rule.choose and returns.per_session):
+        if are_equal or not (store.has_items and config.rule.choose and returns.per_session):
             raise InputError(f"{store.path}: {policy} {_NO_VALUE}")
     with lock_path(plan.out, "tuned"), _open_study(plan.out) as study:
         with damage_explained(plan.out / STUDY, _REMEDY):
@@ -125,7 +126,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> Study:
                 study.tell(trial.number, state=TrialState.FAIL)
                 if trial.params:
                     study.enqueue_trial(trial.params)
-            left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
+            left, seed = trials - len(list_finished(study)), search.seed + len(study.trials)
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
         if len(shares) == 1:
             _run_trials(plan, shares[0], seed)
@@ -221,8 +222,7 @@ def _measure_trial(plan: Plan, store: EpisodeStore, trial: Trial) -> float:
     """The metric of a trial, whose run is deleted unless it is the best."""
 
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
-        """End the trial where its loss is above the median of the others of its policy, as losses
-        of different policies are not of the same quantity."""
+        """End the trial if its loss is above the median of its policy's, which are comparable."""
         if not plan.prune or (loss := logged.get("validation_loss")) is None:
             return
         losses = [
@@ -292,21 +292,19 @@ def importances(study: Study) -> dict[str, float]:
 def _write_report(study: Study, plan: Plan, config: Config) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
     file = plan.out / BEST_TOML
-    names = {*study.best_params} - {POLICY}
     chosen, tables = asdict(config), dict[str, str]()
-    for name in sorted({*plan.search.fixed, *names}):
+    for name in sorted({*plan.search.fixed, *study.best_params} - {POLICY}):
         table, _, field = name.partition(".")
         tables.setdefault(table, f"\n[{table}]\n")
         tables[table] += f"{field} = {format_toml(chosen[table][field])}\n"
-    options = ("--policy", config.policy_name, "--config", str(file), "--out", "RUN")
-    command = one_line(shlex.join(["ucfrec", "train", str(plan.store), *options]))
-    head = (
-        f"{plan.metric} {study.best_value:.6g} in trial {study.best_trial.number} of "
-        f"{len(list_finished(study))}"
+    command = one_line(
+        f"ucfrec train {quote(str(plan.store))} --policy {quote(config.policy_name)} --config "
+        f"{quote(str(file))} --out RUN"
     )
+    best = study.best_trial
+    head = f"{plan.metric} {best.value:.6g} in trial {best.number} of {len(study.trials)}"
     with atomic_file(file) as scratch:
-        text = f"# {head}\n# {command}\n{''.join(tables.values())}"
-        scratch.write_text(text, encoding="utf-8")
+        scratch.write_text(f"# {head}\n# {command}\n{''.join(tables.values())}", encoding="utf-8")
     shares = [(name, f"{share:.2f}") for name, share in importances(study).items()]
     parts = [
         f"# Search on {plan.store}",

@@ -68,7 +68,8 @@ def update_run(
     Raises:
         InputError: the run or the logs cannot be used, or `out` or `store` is something else.
     """
-    options, trained = options or UpdateOptions(), TrainedPolicy.load(run, split=True)
+    options = options or UpdateOptions()
+    trained = TrainedPolicy.load(run, split=True)
     if trained.item_states is None or trained.counts is None:
         raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
     if trained.record.policy is None:
@@ -106,16 +107,17 @@ def update_run(
     record = train_run(opened, out, config, {"update": update}, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
-        # The drift of the new rows and the verdict.
         added = opened.select(np.arange(opened.n_episodes)[-record.update.episodes :])
-        training, seed = store_before.split("train"), config.seed
+        training = store_before.split("train")
+        seed = config.seed
         changes = measure_drift(trained, training, added, counts, seed)
         split = opened.episode_values(schema.SPLIT)
         newest = opened.split("test")
         earlier = opened.select(np.flatnonzero(split != schema.SPLITS.index("test")))
         users = newest.episode_values(schema.USER)
         rows = UserRows.of(newest, users, earlier)
-        new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
+        new = TrainedPolicy.load(out, split=True)
+        acting = TrainedPolicy.load(trained.folder)
         verdict = compare_runs(new, acting, rows, seed)
         update = record.update.model_copy(update={"drift": changes, "verdict": verdict})
         record = record.copy_with(update=update).write(out)

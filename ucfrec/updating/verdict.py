@@ -166,8 +166,7 @@ def stability_index(old: Array, new: Array) -> float:
 
 
 def popularity_index(old: Array, new: Array) -> float:
-    """`stability_index` of steps that showed each item (n_items,), in groups of about equal old
-    popularity."""
+    """`stability_index` of steps per item (n_items,), in groups of about equal old popularity."""
     order = np.argsort(-old, kind="stable")
     more_popular = np.cumsum(old[order]) - old[order]
     group = np.minimum(_GROUPS * more_popular // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)

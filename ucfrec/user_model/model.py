@@ -139,8 +139,7 @@ class UserModel:
         offer: Offer | None = None,
         above: Tensor | None = None,
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,); see
-        `ItemRewardModel.score`."""
+        """Expected rewards (M,) of items (M,), in states (M, S) of training users (M,)."""
         scores = self.rewarding.score(states, history, users, items, offer, above)
         return self._expect_of(scores, history)
 

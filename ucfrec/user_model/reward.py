@@ -233,7 +233,7 @@ class ItemRewardModel(nn.Module):
         users: Tensor | None,
         tastes: Tensor,
     ) -> Tensor:
-        """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
+        """Part (B,) of the scores that all items share: of states (B, S), users (B,) and their
         `tastes_after` (B, D + 1)."""
         of_user = self.user[self._user_rows(users, states)] + tastes[:, 0]
         return of_user + self.standardise(states) @ self.state

@@ -90,8 +90,7 @@ class Design:
     above: Tensor
     """What `list_inputs` give; (M, 0) where there are no lists."""
     interest: Tensor
-    """(M, D + 1) products of the users' rates and (1, vector) of the items, see `Interests`; (M, 0)
-    where users are not followed."""
+    """(M, D + 1) products of users' rates and (1, vector) of items, see `Interests`; or (M, 0)."""
     tastes: Tensor
     """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
@@ -103,8 +102,7 @@ class Design:
         weights: Tensor | None = None,
         fitted_users: Tensor | None = None,
     ) -> "Design":
-        """The design of `rows`, with the statistics of `model`; by default all count one, and the
-        effects of their users are fitted."""
+        """The design of `rows`, by statistics of `model`; by default users' effects are fitted."""
         likeness = model.likeness
         if fitted_users is None:
             fitted_users = torch.unique(rows.users[rows.users >= 0])
@@ -573,8 +571,7 @@ class EffectSearch:
         model: ItemRewardModel,
         report: Any,
     ) -> None:
-        """Write the model with the effects found, its report, and the effects beside it; `file` is
-        complete last."""
+        """Write the model with its effects, the report, and effects beside; `file` comes last."""
         effects = dict(self.effects)
         for name in effects.keys() & {"user", "affinity"}:
             effects[name] = self._expand_users(effects[name], len(model.user))

@@ -236,8 +236,7 @@ class SessionEnd:
         rewards: Sequence[Tensor],
         steps: Tensor,
     ) -> list[Tensor]:
-        """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
-        each of some rewards (B, C)."""
+        """Probabilities (B, C) that sessions end after items (B, C) at steps (B,), by reward."""
         batch, count = items.shape
         lately, _ = history.padded(_LAGS)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))

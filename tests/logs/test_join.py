@@ -318,14 +318,15 @@ def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None
     assert log.loc["1e1", ["request_id", "run"]].tolist() == ["5e1", "1e3"]
 
 
-@pytest.mark.parametrize("name", ["run", "arm"])
-def test_a_list_of_another_run_or_arm_is_no_repetition(tmp_path: Path, name: str) -> None:
-    """`recommend LOGS` gives a user without new rows the same request id again."""
+@pytest.mark.parametrize("name", ["run", "arm", "day"])
+def test_a_list_of_another_run_or_arm_or_day_is_no_repetition(tmp_path: Path, name: str) -> None:
+    """`recommend LOGS` gives a user without new rows the same request id, and items, again."""
     folder = exposures(tmp_path / "shown")
     again = pd.read_parquet(folder / "one.parquet").assign(**{name: "other"})
     again.assign(timestamp=again.timestamp + 60 * MINUTE).to_parquet(folder / "three.parquet")
-    report, _ = joined(tmp_path, feedback([(1, 10, 67, 1)]), shown=folder)
+    report, log = joined(tmp_path, feedback([(1, 10, 67, 1)]), shown=folder)
     assert (report.exposures, report.repeated, report.matched) == (7, 1, 1)
+    assert log.click.to_numpy().nonzero()[0].tolist() == [6]
 
 
 @pytest.mark.parametrize("written", ["feedback.parquet", "shown/one.parquet"])

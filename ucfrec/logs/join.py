@@ -14,6 +14,7 @@ from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
+from ucfrec.logs.rows import DECISION_MS
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -195,7 +196,8 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
     connection.execute(
         f"CREATE TABLE exposures AS SELECT * EXCLUDE {schema.REWARD}, row_number() OVER "
         f"(ORDER BY timestamp, {_ONE_EXPOSURE}) AS row FROM given_exposures "
-        f"QUALIFY row_number() OVER (PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
+        f"QUALIFY coalesce(timestamp - lag(timestamp) OVER (PARTITION BY {_ONE_EXPOSURE} "
+        f"ORDER BY timestamp) > {DECISION_MS}, true)"
     )
     return further
 

@@ -53,6 +53,8 @@ TIE = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME
 the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
 two items are as often in one order as in the other."""
 DAY_MS = 86_400_000
+DECISION_MS = 1_800_000
+"""A longer pause between rows of one request parts them into two decisions."""
 REASONS = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
@@ -150,6 +152,8 @@ class SortedRows:
     """Number of duplicates with another reward than the row that counts."""
     tied: int = 0
     """Number of rows that share their user and time."""
+    repeated_positions: int = 0
+    """Number of rows with a position that another row of their request has."""
     has_lists: bool = False
     """Whether some decision has several rows."""
     unsorted: int = 0
@@ -217,8 +221,9 @@ class SortedRows:
             _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
             order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
-        batch[schema.PLACE] = places = _find_places(batch, by_session)
-        self.has_lists |= bool(places.any())
+        batch, repeated_positions = _place_in_lists(batch, by_session)
+        self.repeated_positions += repeated_positions
+        self.has_lists |= bool(batch[schema.PLACE].any())
         self.file.append(batch)
 
     def _put_winners_first(
@@ -239,18 +244,31 @@ class SortedRows:
         return {name: values[source] for name, values in batch.items()}
 
 
-def _find_places(batch: dict[str, Array], by_session: bool) -> IntArray:
-    """(M,) place of each row in its decision, from 0, of rows in order, which lose their requests
-    and positions."""
-    batch.pop(schema.POSITION, None)
-    decision = batch.pop(_REQUEST, batch[schema.TIMESTAMP])
-    goes_on = _equal_before(batch[USER]) & _equal_before(decision)
+def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
+    """Rows in order, with their places in their decisions, from 0, instead of requests and
+    positions; and how many repeat a position of their decision, with which another one begins."""
+    batch, times, repeated = {**batch}, batch[schema.TIMESTAMP], 0
+    positions = batch.pop(schema.POSITION, np.full(len(times), np.inf))
+    goes_on = _equal_before(batch[USER]) & _equal_before(batch.pop(_REQUEST, times))
+    goes_on &= times[1:] - times[:-1] <= DECISION_MS
     if by_session:
         goes_on &= _equal_before(batch[SESSION])
-    rows = np.arange(len(decision))
-    return (rows - np.maximum.accumulate(np.where(np.append(False, goes_on), 0, rows))).astype(
-        "<i4"
-    )
+    begins, rows = np.append(True, ~goes_on), np.arange(len(times))
+    back = goes_on & (positions[1:] <= positions[:-1])
+    if np.isfinite(positions[1:][back]).any():
+        decisions = np.cumsum(begins)
+        order = np.lexsort((positions, decisions))
+        again = _equal_before(decisions[order]) & _equal_before(positions[order])
+        again &= np.isfinite(positions[order][1:])
+        repeated = int(np.count_nonzero(again))
+        occurrences = rows - np.maximum.accumulate(np.where(np.append(False, again), 0, rows))
+        occurrences = occurrences[np.argsort(order)]
+        order = np.lexsort((occurrences, times, decisions))
+        batch = {name: values[order] for name, values in batch.items()}
+        lists = np.maximum.accumulate((decisions * len(rows) + occurrences)[order])
+        begins = np.append(True, ~_equal_before(lists))
+    places = rows - np.maximum.accumulate(np.where(begins, rows, 0))
+    return {**batch, schema.PLACE: places.astype("<i4")}, repeated
 
 
 def _equal_before(values: Array) -> BoolArray:

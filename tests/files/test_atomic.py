@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.errors import InputError
+from ucfrec.files import atomic
 from ucfrec.files.atomic import (
     atomic_file,
     atomic_folder,
@@ -191,6 +194,32 @@ def test_one_process_may_claim_within_its_claim(tmp_path: Path) -> None:
         with claim(path.with_name("other")) as other:
             assert other
     assert names(tmp_path / "made") == ["out"]
+
+
+def test_an_interruption_at_any_moment_leaves_nothing_at_the_end(tmp_path: Path) -> None:
+    def interrupt(frame: FrameType, event: str, _: object) -> Any:
+        if frame.f_code.co_filename != atomic.__file__:
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode" and next(moments, None) is None:
+            sys.settrace(before)
+            raise KeyboardInterrupt
+        return interrupt
+
+    before = sys.gettrace()
+    for moment in count():
+        moments = iter(range(moment))
+        sys.settrace(interrupt)
+        try:
+            with atomic.scratch_folder(tmp_path, "rows") as scratch:
+                (scratch / "row").touch()
+            break
+        except KeyboardInterrupt:
+            atomic.release_locks()
+            assert not names(tmp_path)
+        finally:
+            sys.settrace(before)
+    assert moment > 100  # of some 600
 
 
 def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:

@@ -3,11 +3,9 @@
 import json
 import math
 import os
-import signal
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -51,12 +49,6 @@ def forked(work: Callable[[], None]) -> int:
     return child
 
 
-def kill(child: int, seconds: float) -> None:
-    time.sleep(seconds)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-
-
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")
@@ -86,19 +78,6 @@ def test_a_block_that_raises_changes_nothing(tmp_path: Path, error: type[BaseExc
         scratch.write_text("new")
         assert (tmp_path / "a.txt").read_text() == "old"
     assert (tmp_path / "a.txt").read_text() == "new"
-
-
-def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:
-    target = tmp_path / "a.json"
-    write_json(target, {"numbers": list(range(2000))})
-
-    def rewrite() -> None:
-        while True:
-            write_json(target, {"numbers": list(range(2000))})
-
-    for attempt in range(6):
-        kill(forked(rewrite), 0.003 + 0.001 * attempt)
-        assert read_json(target) == {"numbers": list(range(2000))}
 
 
 json_values = st.recursive(
@@ -202,11 +181,10 @@ def test_an_interruption_at_any_moment_leaves_nothing_at_the_end(tmp_path: Path)
             return None
         frame.f_trace_opcodes = True
         if event == "opcode" and next(moments, None) is None:
-            sys.settrace(before)
+            sys.settrace(None)
             raise KeyboardInterrupt
         return interrupt
 
-    before = sys.gettrace()
     for moment in count():
         moments = iter(range(moment))
         sys.settrace(interrupt)
@@ -218,7 +196,7 @@ def test_an_interruption_at_any_moment_leaves_nothing_at_the_end(tmp_path: Path)
             atomic.release_locks()
             assert not names(tmp_path)
         finally:
-            sys.settrace(before)
+            sys.settrace(None)
     assert moment > 100  # of some 600
 
 

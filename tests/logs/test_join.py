@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.killed import kills
 from tests.support.logs import START
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
@@ -264,25 +263,6 @@ def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -
     note = str(notes[0].message)
     assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note
     assert told in note
-
-
-@pytest.mark.slow
-def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> None:
-    rows = 200_000
-    frame = pd.DataFrame({"user_id": [str(n % 977) for n in range(rows)]})
-    frame["item_id"] = frame.index % 83
-    frame = frame.assign(timestamp=START + frame.index, request_id=frame.index.astype(str))
-    frame = frame.assign(position=1, propensity=0.5, run="r", rule="d")
-    (tmp_path / "shown").mkdir()
-    frame.to_parquet(tmp_path / "shown" / "a.parquet")
-    clicked = frame[::7][["user_id", "item_id", "timestamp", "request_id"]].assign(click=1)
-    clicked.to_parquet(tmp_path / "feedback.parquet")
-    assert kills("join", tmp_path) >= 2
-    log = pd.read_parquet(tmp_path / "joined.parquet")
-    assert len(log) == rows
-    assert log.click.sum() == log.feedback.sum() == len(clicked)
-    left = sorted(path.name for path in tmp_path.glob("*.parquet"))
-    assert left == ["feedback.parquet", "joined.parquet"]
 
 
 def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:

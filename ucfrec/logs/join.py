@@ -104,8 +104,7 @@ def join_feedback(
     the log has the largest value, other than 0, of every column that is a number or a truth value;
     0 where there is none.
 
-    An `InputNote` says which columns of feedback are left out, as they are text or have the name of
-    a column of exposures, and what may be wrong where a fifth of the feedback or more has no match.
+    An `InputNote` says which columns are left out, and what may be wrong if a fifth has no match.
 
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.

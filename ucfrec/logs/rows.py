@@ -1,11 +1,7 @@
 """Which rows of a log count, and in which order: one rule for files, frames and requests.
 
-One ORDER BY, then one pass: the SQL is run by DuckDB or by Spark and means the same to both, and
-what follows compares a row with the one before.
-
-Rows of one user at one time, such as a page that was logged at once or a log of days, have no order
-that could be learned: theirs is that of a hash of user, time and item. Any other order, such as
-that of the ids, is one that a policy predicts.
+One ORDER BY, by DuckDB or by Spark, then one pass that compares a row with the one before. Rows of
+one user at one time are ordered by a hash: a policy would predict any order such as that of ids.
 """
 
 import hashlib
@@ -70,8 +66,7 @@ REASONS = {
 
 
 class RowVectors:
-    """The observation of every row of a log, in a file or in memory. Long rows are not sorted:
-    where a row was in the files, its observation is read at the end."""
+    """The observation of every row of a log, in a file or in memory, read at the end."""
 
     def __init__(
         self,
@@ -179,7 +174,7 @@ class SortedRows:
         repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
         if repeated.any():
             batch = self._put_winners_first(batch, repeated, duplicates)
-            winners = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
+            winners = np.arange(len(repeated)) - _count_since(~repeated)
             rewards = batch[schema.REWARD]
             lost, counted = rewards[repeated], rewards[winners[repeated]]
             equal = (lost == counted) | (np.isnan(lost) & np.isnan(counted))
@@ -196,8 +191,7 @@ class SortedRows:
         same_user = _equal_before(batch[USER])
         tied = np.concatenate([[False], same_user & _equal_before(times), [False]])
         self.tied += int(np.count_nonzero(tied[1:] | tied[:-1]))
-        later = same_user & (times[1:] > times[:-1])
-        moved = later & (rows[1:] < rows[:-1])
+        moved = same_user & (np.diff(times) > 0) & (np.diff(rows) < 0)
         self.unsorted += int(np.count_nonzero(moved))
         self.count += len(times)
         self.first_ms = min(self.first_ms, int(times.min()))
@@ -245,30 +239,36 @@ class SortedRows:
 
 
 def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
-    """Rows in order, with their places in their decisions, from 0, instead of requests and
-    positions; and how many repeat a position of their decision, with which another one begins."""
-    batch, times, repeated = {**batch}, batch[schema.TIMESTAMP], 0
-    positions = batch.pop(schema.POSITION, np.full(len(times), np.inf))
+    """Rows in order, with their places in their decisions instead of requests and positions, and
+    how many repeat a position of their decision, with which another one begins."""
+    batch, repeated = {**batch}, 0
+    times = batch[schema.TIMESTAMP]
+    positions = batch.pop(schema.POSITION, None)
     goes_on = _equal_before(batch[USER]) & _equal_before(batch.pop(_REQUEST, times))
-    goes_on &= times[1:] - times[:-1] <= DECISION_MS
+    goes_on &= np.diff(times) <= DECISION_MS
     if by_session:
         goes_on &= _equal_before(batch[SESSION])
-    begins, rows = np.append(True, ~goes_on), np.arange(len(times))
-    back = goes_on & (positions[1:] <= positions[:-1])
-    if np.isfinite(positions[1:][back]).any():
+    begins = np.append(True, ~goes_on)
+    if positions is not None:
         decisions = np.cumsum(begins)
-        order = np.lexsort((positions, decisions))
-        again = _equal_before(decisions[order]) & _equal_before(positions[order])
-        again &= np.isfinite(positions[order][1:])
-        repeated = int(np.count_nonzero(again))
-        occurrences = rows - np.maximum.accumulate(np.where(np.append(False, again), 0, rows))
-        occurrences = occurrences[np.argsort(order)]
-        order = np.lexsort((occurrences, times, decisions))
-        batch = {name: values[order] for name, values in batch.items()}
-        lists = np.maximum.accumulate((decisions * len(rows) + occurrences)[order])
-        begins = np.append(True, ~_equal_before(lists))
-    places = rows - np.maximum.accumulate(np.where(begins, rows, 0))
-    return {**batch, schema.PLACE: places.astype("<i4")}, repeated
+        # Rows without a position repeat none. Complex numbers sort by their real parts first.
+        positions = np.where(np.isfinite(positions), positions, ~np.arange(len(times)))
+        keys = decisions + 1j * positions
+        order = keys.argsort(kind="stable")
+        first = np.append(True, ~_equal_before(keys[order]))
+        if repeated := int((~first).sum()):
+            occurrences = _count_since(first)[order.argsort()]
+            order = np.lexsort((occurrences, times, decisions))
+            batch = {name: values[order] for name, values in batch.items()}
+            lists = np.maximum.accumulate((decisions * len(times) + occurrences)[order])
+            begins = np.append(True, ~_equal_before(lists))
+    return {**batch, schema.PLACE: _count_since(begins).astype("<i4")}, repeated
+
+
+def _count_since(begins: BoolArray) -> IntArray:
+    """(M,) number of rows since the last one that begins something, as the first does."""
+    rows = np.arange(len(begins))
+    return rows - np.maximum.accumulate(np.where(begins, rows, 0))
 
 
 def _equal_before(values: Array) -> BoolArray:
@@ -300,13 +300,10 @@ def sort_rows(
     by_session: bool = False,
     held: pa.Table | None = None,
 ) -> SortedRows:
-    """Sort the rows of a log with DuckDB.
+    """Sort the rows of a log with DuckDB, `folder` for scratch (None for a log in memory).
 
-    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
-    `duplicates` is as of `PrepareOptions`, `folder` for scratch (None for a log in memory). With
-    `by_session`, the rows of a session follow each other. Rows whose user, item and time are those
-    of a row of `held` (ids are text) are duplicates. Raises InputError if a reward is too
-    large to train with.
+    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped; those
+    with the user, item and time of a row of `held` (ids are text) are duplicates.
     """
     connection = log.connection
     if held is not None:
@@ -497,11 +494,7 @@ def choose_rows(
 
 def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
-    is the first.
-
-    Other columns decide between rows that are equal to the rule, so that the order of rows and
-    files does not matter; of rows that are equal throughout, it is the first in the files.
-    """
+    is the first: by the rule, then by other columns, so that the order of files does not matter."""
     rewards = rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
     rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}

@@ -302,12 +302,9 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             "the user: they count as one list, whose order is unknown and is not learned; log "
             "finer times, or columns request_id and position",
         )
-    if rows.repeated_positions:
-        _note(
-            rows,
-            f"{rows.repeated_positions:,} rows repeat a {schema.POSITION} of their "
-            f"{schema.REQUEST_ID} and count as another list; give every list an id of its own",
-        )
+    if count := rows.repeated_positions:
+        what = "rows repeat a position of their request_id and count as another list"
+        _note(rows, f"{count:,} {what}; give every list an id of its own")
     if report.get("items") == 1:
         _note(
             rows,

@@ -241,8 +241,8 @@ class SortedRows:
 def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
     """Rows in order, with their places in their decisions instead of requests and positions, and
     how many repeat a position of their decision, with which another one begins."""
-    batch, repeated = {**batch}, 0
     times = batch[schema.TIMESTAMP]
+    repeated = 0
     positions = batch.pop(schema.POSITION, None)
     goes_on = _equal_before(batch[USER]) & _equal_before(batch.pop(_REQUEST, times))
     goes_on &= np.diff(times) <= DECISION_MS

@@ -1,9 +1,7 @@
 """Plugins: simulators, datasets, benchmarks and policies that packages declare as entry points.
 
 A package adds a simulator to the command line by declaring, in the entry-point group
-`ucfrec.simulators`, a short name that points to a `Simulator`. Datasets are declared in
-`ucfrec.datasets`, benchmarks (`ucfrec.benchmark.suite.Benchmark`) in `ucfrec.benchmarks`, and
-policies (classes derived from `ucfrec.policies.base.SequencePolicy`) in `ucfrec.policies`.
+`ucfrec.simulators`, a short name that points to a `Simulator`; the other groups are alike.
 """
 
 from importlib import import_module

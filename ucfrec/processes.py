@@ -186,10 +186,7 @@ def require_blas_memory() -> None:
 
 @contextmanager
 def random_state_kept() -> Iterator[None]:
-    """Restore the global generators of torch (every device), numpy and `random` on exit.
-
-    Usable in a `with` statement and as the decorator `@random_state_kept()`.
-    """
+    """Restore the global generators of torch (every device), numpy and `random` on exit."""
     import numpy as np  # commands that compute nothing need neither
     import torch
 

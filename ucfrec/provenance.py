@@ -26,10 +26,7 @@ def versions(packages: Sequence[str] = ()) -> dict[str, str]:
 
 
 def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
-    """Command, commit and `versions` of this process, as every result row records them.
-
-    The commit is that of the checkout that ucfrec is imported from; None for an installed wheel.
-    """
+    """Command, commit (None for an installed wheel) and `versions`, as result rows record them."""
     root, commit = Path(__file__).resolve().parent.parent, None
     if (root / ".git").exists():
         command = ["git", "-C", str(root), "rev-parse", "HEAD"]
@@ -39,10 +36,7 @@ def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """The command of this process, with absolute paths shortened to their last component.
-
-    Result rows are published and must not reveal the folders of a machine.
-    """
+    """The command of this process, without the folders of the machine: result rows are public."""
     program, *words = sys.argv
     return " ".join([Path(program).name, *map(shorten_paths, words)])
 

@@ -3,13 +3,13 @@
 import json
 import math
 import os
-import signal
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.errors import InputError
+from ucfrec.files import atomic
 from ucfrec.files.atomic import (
     atomic_file,
     atomic_folder,
@@ -46,12 +47,6 @@ def forked(work: Callable[[], None]) -> int:
         finally:
             os._exit(status)
     return child
-
-
-def kill(child: int, seconds: float) -> None:
-    time.sleep(seconds)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
 
 
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
@@ -83,19 +78,6 @@ def test_a_block_that_raises_changes_nothing(tmp_path: Path, error: type[BaseExc
         scratch.write_text("new")
         assert (tmp_path / "a.txt").read_text() == "old"
     assert (tmp_path / "a.txt").read_text() == "new"
-
-
-def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:
-    target = tmp_path / "a.json"
-    write_json(target, {"numbers": list(range(2000))})
-
-    def rewrite() -> None:
-        while True:
-            write_json(target, {"numbers": list(range(2000))})
-
-    for attempt in range(6):
-        kill(forked(rewrite), 0.003 + 0.001 * attempt)
-        assert read_json(target) == {"numbers": list(range(2000))}
 
 
 json_values = st.recursive(
@@ -191,6 +173,31 @@ def test_one_process_may_claim_within_its_claim(tmp_path: Path) -> None:
         with claim(path.with_name("other")) as other:
             assert other
     assert names(tmp_path / "made") == ["out"]
+
+
+def test_an_interruption_at_any_moment_leaves_nothing_at_the_end(tmp_path: Path) -> None:
+    def interrupt(frame: FrameType, event: str, _: object) -> Any:
+        if frame.f_code.co_filename != atomic.__file__:
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode" and next(moments, None) is None:
+            sys.settrace(None)
+            raise KeyboardInterrupt
+        return interrupt
+
+    for moment in count():
+        moments = iter(range(moment))
+        sys.settrace(interrupt)
+        try:
+            with atomic.scratch_folder(tmp_path, "rows") as scratch:
+                (scratch / "row").touch()
+            break
+        except KeyboardInterrupt:
+            atomic.release_locks()
+            assert not names(tmp_path)
+        finally:
+            sys.settrace(None)
+    assert moment > 100  # of some 600
 
 
 def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:

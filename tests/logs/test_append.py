@@ -1,5 +1,6 @@
 """A grown store has all rows of its logs once, with the old numbers, and reads no old log."""
 
+import shutil
 import warnings
 from pathlib import Path
 
@@ -191,6 +192,13 @@ def test_logs_that_are_all_old_or_too_short_are_refused(grown: Path, tmp_path: P
     with pytest.raises(InputError, match=r"\(1, in 1 session\(s\)\) leave no validation rows"):
         append_logs(grown / "store", [tmp_path / "one.parquet"], out)
     assert not out.exists()
+
+
+def test_a_damaged_store_does_not_grow(grown: Path, tmp_path: Path) -> None:
+    file = shutil.copytree(grown / "store", tmp_path / "store") / "shard-00000" / "offsets.npy"
+    file.write_bytes(file.read_bytes()[:-1] + b"\xff")
+    with pytest.raises(InputError, match=r"store/shard-00000/offsets\.npy has another content"):
+        append_logs(tmp_path / "store", [grown / "later.parquet"], tmp_path / "grown")
 
 
 @pytest.mark.parametrize("name", ["user_id", "item_id"])

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.killed import kills
 from tests.support.logs import START
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
@@ -266,25 +265,6 @@ def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -
     assert told in note
 
 
-@pytest.mark.slow
-def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> None:
-    rows = 200_000
-    frame = pd.DataFrame({"user_id": [str(n % 977) for n in range(rows)]})
-    frame["item_id"] = frame.index % 83
-    frame = frame.assign(timestamp=START + frame.index, request_id=frame.index.astype(str))
-    frame = frame.assign(position=1, propensity=0.5, run="r", rule="d")
-    (tmp_path / "shown").mkdir()
-    frame.to_parquet(tmp_path / "shown" / "a.parquet")
-    clicked = frame[::7][["user_id", "item_id", "timestamp", "request_id"]].assign(click=1)
-    clicked.to_parquet(tmp_path / "feedback.parquet")
-    assert kills("join", tmp_path) >= 2
-    log = pd.read_parquet(tmp_path / "joined.parquet")
-    assert len(log) == rows
-    assert log.click.sum() == log.feedback.sum() == len(clicked)
-    left = sorted(path.name for path in tmp_path.glob("*.parquet"))
-    assert left == ["feedback.parquet", "joined.parquet"]
-
-
 def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
     given = feedback([(1, 10, 7, 1, "app"), (1, 11, 2, 1, "bot"), (2, 10, 6, 1, "bot")], "source")
     for day, rows in {"01": given[:2], "02": given[2:]}.items():
@@ -318,14 +298,15 @@ def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None
     assert log.loc["1e1", ["request_id", "run"]].tolist() == ["5e1", "1e3"]
 
 
-@pytest.mark.parametrize("name", ["run", "arm"])
-def test_a_list_of_another_run_or_arm_is_no_repetition(tmp_path: Path, name: str) -> None:
-    """`recommend LOGS` gives a user without new rows the same request id again."""
+@pytest.mark.parametrize("name", ["run", "arm", "day"])
+def test_a_list_of_another_run_or_arm_or_day_is_no_repetition(tmp_path: Path, name: str) -> None:
+    """`recommend LOGS` gives a user without new rows the same request id, and items, again."""
     folder = exposures(tmp_path / "shown")
     again = pd.read_parquet(folder / "one.parquet").assign(**{name: "other"})
     again.assign(timestamp=again.timestamp + 60 * MINUTE).to_parquet(folder / "three.parquet")
-    report, _ = joined(tmp_path, feedback([(1, 10, 67, 1)]), shown=folder)
+    report, log = joined(tmp_path, feedback([(1, 10, 67, 1)]), shown=folder)
     assert (report.exposures, report.repeated, report.matched) == (7, 1, 1)
+    assert log.click.to_numpy().nonzero()[0].tolist() == [6]
 
 
 @pytest.mark.parametrize("written", ["feedback.parquet", "shown/one.parquet"])

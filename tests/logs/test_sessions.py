@@ -1,5 +1,6 @@
 """Sessions end where they must, and splits begin at the row that they name."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -47,18 +48,33 @@ def test_splits_begin_at_a_place_of_the_sorted_times(
 
 def test_a_request_is_one_decision_whatever_the_order_of_its_rows(tmp_path: Path) -> None:
     """Over a pause, with another session_id, without a position; rows without one stand alone."""
-    hours = np.repeat([0, 1, 2, 3, 4], [1, 1, 1, 3, 3]) * 3_600_000
-    log = pd.read_parquet(write_log(tmp_path, hours, item_id=range(9), session_id=range(9)))
+    times = np.repeat([0, 1, 2, 3, 4], [1, 1, 1, 3, 3]) * 1_800_000
+    log = pd.read_parquet(write_log(tmp_path, times, item_id=range(9), session_id=range(9)))
     log["request_id"] = ["a"] * 3 + [None] * 3 + ["b"] * 3
     log["position"] = [0, 1, 2, None, None, None, 2, 1, None]
     log = pd.concat([log, log.assign(position=9 - log.position, excludes_seen=True)])
-    options, stores = PrepareOptions(split=(1.0, 0.0, 0.0), session_by="gap", min_steps=1), []
+    options, stores = PrepareOptions(split=(1.0, 0.0, 0.0), session_by="gap", gap_minutes=20), []
     for seed in range(4):
         log.sample(frac=1, random_state=seed).to_parquet(tmp_path / "log.parquet")
         prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / f"{seed}", options)
         stores.append(EpisodeStore.open(tmp_path / f"{seed}"))
         assert stores[seed].column("place").tolist() == [0, 1, 2, 0, 0, 0, 0, 1, 2]
         assert stores[seed].record.fingerprint == stores[0].record.fingerprint
+
+
+@pytest.mark.parametrize(("pause", "listed"), [(0, 1), (5_000, 1), (10**8, 1), (10**8, 0)])
+def test_a_request_id_that_comes_again_is_another_decision(
+    tmp_path: Path, pause: int, listed: int
+) -> None:
+    rows = {"request_id": "a", "position": [1, 2, 3] * 2 if listed else None}
+    path = write_log(tmp_path, np.repeat([0, pause], 3), item_id=range(6), **rows)
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        prepare([path], LogMapping(), tmp_path / "store", PrepareOptions(split=(1.0, 0.0, 0.0)))
+    store = EpisodeStore.open(tmp_path / "store")
+    assert store.column("place").tolist() == [0, 1, 2] * 2
+    assert store.lengths.tolist() == ([3, 3] if pause == 10**8 else [6])
+    assert any("3 rows repeat" in str(note.message) for note in notes) == (pause < 10**8)
 
 
 def test_rows_before_the_one_that_precedes_them_in_time_are_out_of_order(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """A training, and parts of the daily loop, in processes that are killed at random moments.
 
-    python killed_loop.py run|update|promote|join|exposures FOLDER
+    python killed_loop.py run|update|promote|exposures FOLDER
 
 Prints how many were killed. What a kill leaves is checked here, the end by the caller."""
 
@@ -19,7 +19,6 @@ from tests.support import killed_run
 from tests.support.killed_training import life, optimizer_imported
 from tests.support.later import later_mapping
 from tests.support.short_validation import short_validation
-from ucfrec.logs.join import join_feedback
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.responder import Answer
 from ucfrec.runs.promoted import promote, promoted
@@ -49,17 +48,6 @@ def promoted_is_whole(folder: Path) -> None:
     found = promoted(folder)
     assert found.current in ("run", "other")
     TrainedPolicy.load(found.run(folder))
-
-
-def join(folder: Path) -> None:
-    """Join, until it is done."""
-    feedback = [folder / "feedback.parquet"]
-    join_feedback([folder / "shown"], feedback, folder / "joined.parquet", 10**9)
-
-
-def joined_is_whole(folder: Path) -> None:
-    if (folder / "joined.parquet").exists():
-        assert len(pd.read_parquet(folder / "joined.parquet")) > 0
 
 
 def write_exposures(folder: Path) -> None:
@@ -98,7 +86,6 @@ WORK: dict[str, tuple[Callable[[Path], None], Callable[[Path], None], float]] = 
     "run": (run, lambda folder: None, 0.4),
     "update": (update, lambda folder: None, 1.0),
     "promote": (promote_often, promoted_is_whole, 0.3),
-    "join": (join, joined_is_whole, 0.1),
     "exposures": (write_exposures, exposures_are_whole, 0.6),
 }
 

@@ -6,6 +6,7 @@ the lock when the process ends, also when it is killed; whoever gets the lock ne
 scratch is dead, and removes it.
 """
 
+import atexit
 import json
 import os
 import secrets
@@ -35,6 +36,7 @@ _LARGEST_TOML = 2**24
 
 _held: set[tuple[int, Path]] = set()
 """(process, path) of the claims that are held; a fork holds none of its parent's."""
+_locks: set[BaseFileLock] = set()
 
 
 @contextmanager
@@ -44,10 +46,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     with lock_path(path):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already; remove it or name another output folder")
-        with _scratch(path) as scratch:
-            scratch.mkdir()
-            yield scratch
-            scratch.replace(path)
+        scratch = _clear_scratch(path)
+        scratch.mkdir()
+        yield scratch
+        scratch.replace(path)
 
 
 @contextmanager
@@ -59,7 +61,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
-    with claim(path, wait=True), _scratch(path) as scratch:
+    with claim(path, wait=True):
+        scratch = _clear_scratch(path)
         yield scratch
         scratch.replace(path)
 
@@ -68,21 +71,17 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
     """Yield a new folder in `parent` that no other user can read; removed at the end."""
     path = parent / f"{name}-{secrets.token_hex(8)}"
-    with lock_path(path), _scratch(path) as scratch:
+    with lock_path(path):
+        scratch = _clear_scratch(path)
         scratch.mkdir(mode=0o700)
         yield scratch
 
 
-@contextmanager
-def _scratch(path: Path) -> Iterator[Path]:
-    """The scratch of a claimed path, removed at the end."""
+def _clear_scratch(path: Path) -> Path:
+    """The scratch of a claimed path, of which nothing is there; the claim removes it at its end."""
     remove_leftovers(path.parent)
-    scratch = scratch_of(path)
-    _remove(scratch)
-    try:
-        yield scratch
-    finally:
-        _remove(scratch)
+    _remove(scratch_of(path))
+    return scratch_of(path)
 
 
 def scratch_of(path: Path) -> Path:
@@ -115,11 +114,12 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
     if lock is None:
         yield False
         return
-    _held.add(key)
     try:
+        _held.add(key)
         yield True
     finally:
         _held.discard(key)
+        _remove(scratch_of(path))
         _release(lock)
         with suppress(OSError):  # those that are empty go; the inner ones come first
             for folder in new_folders:
@@ -149,13 +149,23 @@ def remove_leftovers(folder: Path, within: bool = False) -> None:
     """Remove the scratch and locks of processes that were killed while they wrote in `folder`,
     and `within`, in every folder inside."""
     for file in [*folder.glob(f"{'**/' * within}.?*{LOCK}")]:
-        path = file.with_name(file.name[1 : -len(LOCK)])
-        if (os.getpid(), path.parent.resolve() / path.name) in _held:
-            continue
-        with suppress(OSError):  # of another user
-            if (lock := _acquire(file, 0.0)) is not None:
-                _remove(scratch_of(path))
-                _release(lock)
+        _remove_leftover(file)
+
+
+@atexit.register
+def release_locks() -> None:
+    """Remove what interruptions of this process while claims began and ended have left."""
+    while _locks:
+        lock = _locks.pop()
+        lock.release(force=True)
+        _remove_leftover(Path(lock.lock_file))
+
+
+def _remove_leftover(file: Path) -> None:
+    with suppress(OSError):  # of another user
+        if (lock := _acquire(file, 0.0)) is not None:
+            _remove(scratch_of(file.with_name(file.name[1 : -len(LOCK)])))
+            _release(lock)
 
 
 def _remove(path: Path) -> None:
@@ -173,6 +183,7 @@ def _acquire(file: Path, seconds: float) -> BaseFileLock | None:
     """The held lock; None if another process holds it for longer than `seconds`."""
     # A generator that holds a claim may be closed by another thread.
     lock = FileLock(file, thread_local=False, poll_interval=0.01)
+    _locks.add(lock)
     try:
         lock.acquire(timeout=seconds)
         program = Path(sys.argv[0] or "python").name
@@ -184,6 +195,7 @@ def _acquire(file: Path, seconds: float) -> BaseFileLock | None:
             content.write(b" " + holder.encode())
             content.truncate()
     except Timeout:
+        _locks.discard(lock)
         return None
     except BaseException:
         _release(lock)
@@ -197,6 +209,7 @@ def _release(lock: BaseFileLock) -> None:
         with suppress(OSError):
             Path(lock.lock_file).unlink()
     lock.release()
+    _locks.discard(lock)
 
 
 def json_text(value: Any, **layout: Any) -> str:

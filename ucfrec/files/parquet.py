@@ -24,9 +24,8 @@ _NO_THREAD = "Failed to launch worker thread"
 def require_plausible_rows(path: Path, rows: int) -> None:
     """Check that a Parquet file does not unfold into very many equal rows.
 
-    A log has at least a user, an item and a time a row, which take some bytes however well they are
-    compressed; ten rows a byte can only be repetitions, of which duplicates are dropped anyway.
-    InputError if it claims over a million rows, and over ten for each of its bytes.
+    InputError if it claims over a million rows, and over ten for each of its bytes, which can only
+    be repetitions.
     """
     size = path.stat().st_size
     if rows > max(_FEW_ROWS, _ROWS_PER_BYTE * size):

@@ -3,8 +3,7 @@
 A subclass of `Record` declares its entries with their types; reading checks them all. What is
 missing, of another type or out of range is one `InputError` that names file and entry.
 
-Checksums are XXH3 (64 bits), which runs at the speed of memory, where CRC-32 of zlib has a quarter
-of it. They find accidents, not forgers: who can change a file can change its checksum.
+Checksums (XXH3, 64 bits) find accidents, not forgers.
 """
 
 import math

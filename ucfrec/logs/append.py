@@ -69,10 +69,9 @@ def append_logs(
 ) -> dict[str, Any]:
     """Write a store of the old episodes and of those of new logs, atomically.
 
-    Old shards are hard links where the file system allows it. Logs that are given twice count once:
-    rows that are not after the end of the store (`find_end`) are left out and counted as
-    `clock_out_of_range`; later ones whose user, item and time a row of the store has are left out
-    as duplicates. A session that goes on in the new logs is two episodes.
+    Logs that are given twice count once: rows that are not after the end of the store (`find_end`)
+    are left out as `clock_out_of_range`, later ones whose user, item and time a row of the store
+    has as duplicates. A session that goes on in the new logs is two episodes.
 
     Args:
         store: folder of a store of items that `prepare` or this function wrote.
@@ -101,6 +100,7 @@ def append_logs(
             )
         _require_held_out(str(out), remembered["appended"])
         return dict(remembered["appended"])
+    old.require(store, *old.files)
     origin = str(store / StoreRecord.FILE)
     shards = [_Shard(store / f"shard-{number:05d}") for number in range(old.n_shards)]
     every = (shard.times for shard in shards)
@@ -142,8 +142,7 @@ def find_end(times: IntArray) -> int:
     clocks of a few rows were fast.
 
     The last rows are such if the rows before them, up to `_DENSER` times as many, are more than
-    `_DENSER` times as dense; of several numbers of last rows, the one where they are densest
-    counts. Example: a row every 30 seconds and a last one that is more than 10 minutes later.
+    `_DENSER` times as dense, as a row every 30 seconds before one that is 10 minutes later.
     """
     latest, last = np.sort(times)[::-1], len(times) - 1
     late = np.arange(1, max(len(times) // (_DENSER + 1), 1) + 1)

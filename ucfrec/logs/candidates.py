@@ -47,8 +47,7 @@ def list_set_files(mapping: LogMapping, files: Sequence[Path]) -> list[Path]:
 def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | None:
     """Number the sets of candidates of a log, after `number_ids`; None if no row has one.
 
-    Sets of the same known items are one. Those of `older`, as of `Offers.sets`, keep their numbers;
-    others follow, ordered by their items.
+    Sets of `older`, as of `Offers.sets`, keep their numbers; others follow, ordered by their items.
 
     Returns (K + 1,) the set of each code of candidates, −1 for none and for a set without a
     known item; and (2, C) all sets, as of `Offers.sets`. Raises InputError if a table of sets

@@ -57,7 +57,7 @@ _OF_JOIN = (
 """Log columns that logs of `join` have."""
 _NAME = re.compile(r"[^\W\d]\w*")
 _OF_ENGINE = re.compile(r"[A-Z][A-Za-z ]+ Error: ")
-_DISK_FULL = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
+_DISK_FULL = ("No space left", "quota exceeded", "File too large", "max_temp_dir", "requested and")
 """In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
 
@@ -301,8 +301,7 @@ def settle_mapping(
     What is mapped counts. Otherwise a remembered column, condition or reward counts if all files
     have the columns that it needs; if not, the plain name does, and no condition. The column
     `reward` stands for the reward of a log whose columns were mapped. What a log of `join` lacks is
-    not mapped. Raises InputError if a file has neither the remembered column nor the plain one that
-    it must have.
+    not mapped. InputError if a file has neither the remembered column nor the plain one.
     """
     joined = [table for table in tables if table.of_exposures]
     feedback = [table for table in tables if not table.of_exposures]

@@ -61,11 +61,9 @@ def load_features(
 ) -> list[str]:
     """Read feature tables into DuckDB tables, whose names are returned, with columns `id`, `f0`, ….
 
-    The parts of a table are joined by the names of their columns, whatever their order: what a part
-    lacks is missing for its rows. A key is not a feature. `kind` is "item_id" or "user_id"; rows
-    whose key is no id of the log's DuckDB type are excluded.
-
-    Raises InputError if a file or column cannot be used, two parts have a column of different
+    The parts of a table are joined by the names of their columns: what a part lacks is missing for
+    its rows. `kind` is "item_id" or "user_id"; rows whose key is no id of the log's DuckDB type are
+    excluded. InputError if a file or column cannot be used, two parts have a column of different
     types, or a table repeats an id.
     """
     names = [f"{kind}_features_{number}" for number in range(len(tables))]
@@ -389,9 +387,8 @@ def encode_features(
     """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`; None if
     there are none.
 
-    Numbers are standardised and clipped, with 0 for missing ones; categories and tags are one-hot.
-    Means, standard deviations and the kept categories come only from ids that occur in the training
-    split (`train_count` above 0). Raises InputError if the vectors of a column differ in length.
+    Numbers are standardised and clipped, 0 where missing; categories and tags are one-hot. Means,
+    deviations and the kept categories are of training rows. InputError if vectors differ in length.
     """
     from scipy import sparse  # takes a moment to import
 

@@ -148,11 +148,9 @@ def item_embeddings(
     """(n_items, D) float32 embeddings by co-occurrence in users' histories and by features.
 
     The co-occurrence part is the truncated SVD of the user × item matrix of exposure and liking,
-    scaled to unit rows. It is averaged with the prediction of a ridge regression from the item's
-    features (n_items, F) (zero without), whose weight grows the fewer times the item was shown: an
-    item never shown has the prediction alone. With features, up to half of the dimensions are the
-    features themselves, reduced by SVD. No embedding has a norm above 1. D is at most `size`, and
-    below it if there are few users, items or features.
+    scaled to unit rows, averaged with the prediction of a ridge regression from the item's features
+    (n_items, F), which weighs more the fewer times the item was shown. With features, up to half of
+    the dimensions, at most `size`, are these, reduced by SVD. No embedding has a norm above 1.
     """
     trained = exposure.trained
     counts = exposure.counts[trained]
@@ -238,11 +236,9 @@ def right_singular_vectors(
     """Largest singular values (rank,) and right singular vectors (rank, n) of a matrix (m, n) whose
     columns are divided by `by_column` (n,).
 
-    The randomised subspace iteration of Halko, Martinsson and Tropp (2011), with the sizes, numbers
-    of iterations and random start of scikit-learn's `randomized_svd`, so that both agree but for
-    rounding (products are in float32) and signs: the largest entry of a vector is above 0. Only
-    matrices with a row for each column are in memory; scikit-learn would also need some with a row
-    for each row. Values beyond the rank of the matrix are 0, and so are their vectors.
+    The randomised subspace iteration of Halko, Martinsson and Tropp (2011), as scikit-learn's
+    `randomized_svd` but for rounding, signs (the largest entry of a vector is above 0) and memory:
+    no matrix with a row for each row. Values beyond the rank are 0, and so are their vectors.
     """
     m, n = matrix.shape
     random = np.random.RandomState(0)
@@ -315,10 +311,8 @@ def write_grown_states(
 ) -> None:
     """Write the item states of the store at `folder`, grown from `store` by `new_shards`.
 
-    With feature tables, new items and users have the vectors that a ridge regression of the old
-    ones on the features predicts, and old ones keep theirs. Without, new ones begin at the mean,
-    and items move towards what their users were shown besides as new training steps outweigh the
-    old.
+    With feature tables, a ridge regression of the old vectors on the features predicts new ones.
+    Without, new ones begin at the mean, and items move towards what their users were shown besides.
     """
     from ucfrec.episodes.states import ItemStates  # needs torch
 

@@ -14,6 +14,7 @@ from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
+from ucfrec.logs.rows import DECISION_MS
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -103,8 +104,7 @@ def join_feedback(
     the log has the largest value, other than 0, of every column that is a number or a truth value;
     0 where there is none.
 
-    An `InputNote` says which columns of feedback are left out, as they are text or have the name of
-    a column of exposures, and what may be wrong where a fifth of the feedback or more has no match.
+    An `InputNote` says which columns are left out, and what may be wrong if a fifth has no match.
 
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
@@ -195,7 +195,8 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
     connection.execute(
         f"CREATE TABLE exposures AS SELECT * EXCLUDE {schema.REWARD}, row_number() OVER "
         f"(ORDER BY timestamp, {_ONE_EXPOSURE}) AS row FROM given_exposures "
-        f"QUALIFY row_number() OVER (PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
+        f"QUALIFY coalesce(timestamp - lag(timestamp) OVER (PARTITION BY {_ONE_EXPOSURE} "
+        f"ORDER BY timestamp) > {DECISION_MS}, true)"
     )
     return further
 

@@ -133,9 +133,8 @@ def prepare(
 ) -> dict[str, Any]:
     """Write the logs as an `EpisodeStore` at `out`, atomically.
 
-    Users and items are those of the log and of the feature tables, in sorted order: rows of
-    `users.parquet` (user_id) and `items.parquet` (item_id), each with its train_count. A session
-    that spans a split boundary is cut there: each piece is an episode, and only the last one is
+    Users and items are those of the log and of the feature tables, in sorted order. A session that
+    spans a split boundary is cut there: each piece is an episode, and only the last one is
     terminated. The same rows give the same fingerprint in any order.
 
     Args:

@@ -1,11 +1,7 @@
 """Which rows of a log count, and in which order: one rule for files, frames and requests.
 
-One ORDER BY, then one pass: the SQL is run by DuckDB or by Spark and means the same to both, and
-what follows compares a row with the one before.
-
-Rows of one user at one time, such as a page that was logged at once or a log of days, have no order
-that could be learned: theirs is that of a hash of user, time and item. Any other order, such as
-that of the ids, is one that a policy predicts.
+One ORDER BY, by DuckDB or by Spark, then one pass that compares a row with the one before. Rows of
+one user at one time are ordered by a hash: a policy would predict any order such as that of ids.
 """
 
 import hashlib
@@ -53,6 +49,8 @@ TIE = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME
 the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
 two items are as often in one order as in the other."""
 DAY_MS = 86_400_000
+DECISION_MS = 1_800_000
+"""A longer pause between rows of one request parts them into two decisions."""
 REASONS = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
@@ -68,8 +66,7 @@ REASONS = {
 
 
 class RowVectors:
-    """The observation of every row of a log, in a file or in memory. Long rows are not sorted:
-    where a row was in the files, its observation is read at the end."""
+    """The observation of every row of a log, in a file or in memory, read at the end."""
 
     def __init__(
         self,
@@ -150,6 +147,8 @@ class SortedRows:
     """Number of duplicates with another reward than the row that counts."""
     tied: int = 0
     """Number of rows that share their user and time."""
+    repeated_positions: int = 0
+    """Number of rows with a position that another row of their request has."""
     has_lists: bool = False
     """Whether some decision has several rows."""
     unsorted: int = 0
@@ -175,7 +174,7 @@ class SortedRows:
         repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
         if repeated.any():
             batch = self._put_winners_first(batch, repeated, duplicates)
-            winners = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
+            winners = np.arange(len(repeated)) - _count_since(~repeated)
             rewards = batch[schema.REWARD]
             lost, counted = rewards[repeated], rewards[winners[repeated]]
             equal = (lost == counted) | (np.isnan(lost) & np.isnan(counted))
@@ -192,8 +191,7 @@ class SortedRows:
         same_user = _equal_before(batch[USER])
         tied = np.concatenate([[False], same_user & _equal_before(times), [False]])
         self.tied += int(np.count_nonzero(tied[1:] | tied[:-1]))
-        later = same_user & (times[1:] > times[:-1])
-        moved = later & (rows[1:] < rows[:-1])
+        moved = same_user & (np.diff(times) > 0) & (np.diff(rows) < 0)
         self.unsorted += int(np.count_nonzero(moved))
         self.count += len(times)
         self.first_ms = min(self.first_ms, int(times.min()))
@@ -217,8 +215,9 @@ class SortedRows:
             _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
             order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
-        batch[schema.PLACE] = places = _find_places(batch, by_session)
-        self.has_lists |= bool(places.any())
+        batch, repeated_positions = _place_in_lists(batch, by_session)
+        self.repeated_positions += repeated_positions
+        self.has_lists |= bool(batch[schema.PLACE].any())
         self.file.append(batch)
 
     def _put_winners_first(
@@ -239,18 +238,37 @@ class SortedRows:
         return {name: values[source] for name, values in batch.items()}
 
 
-def _find_places(batch: dict[str, Array], by_session: bool) -> IntArray:
-    """(M,) place of each row in its decision, from 0, of rows in order, which lose their requests
-    and positions."""
-    batch.pop(schema.POSITION, None)
-    decision = batch.pop(_REQUEST, batch[schema.TIMESTAMP])
-    goes_on = _equal_before(batch[USER]) & _equal_before(decision)
+def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
+    """Rows in order, with their places in their decisions instead of requests and positions, and
+    how many repeat a position of their decision, with which another one begins."""
+    times = batch[schema.TIMESTAMP]
+    repeated = 0
+    positions = batch.pop(schema.POSITION, None)
+    goes_on = _equal_before(batch[USER]) & _equal_before(batch.pop(_REQUEST, times))
+    goes_on &= np.diff(times) <= DECISION_MS
     if by_session:
         goes_on &= _equal_before(batch[SESSION])
-    rows = np.arange(len(decision))
-    return (rows - np.maximum.accumulate(np.where(np.append(False, goes_on), 0, rows))).astype(
-        "<i4"
-    )
+    begins = np.append(True, ~goes_on)
+    if positions is not None:
+        decisions = np.cumsum(begins)
+        # Rows without a position repeat none. Complex numbers sort by their real parts first.
+        positions = np.where(np.isfinite(positions), positions, ~np.arange(len(times)))
+        keys = decisions + 1j * positions
+        order = keys.argsort(kind="stable")
+        first = np.append(True, ~_equal_before(keys[order]))
+        if repeated := int((~first).sum()):
+            occurrences = _count_since(first)[order.argsort()]
+            order = np.lexsort((occurrences, times, decisions))
+            batch = {name: values[order] for name, values in batch.items()}
+            lists = np.maximum.accumulate((decisions * len(times) + occurrences)[order])
+            begins = np.append(True, ~_equal_before(lists))
+    return {**batch, schema.PLACE: _count_since(begins).astype("<i4")}, repeated
+
+
+def _count_since(begins: BoolArray) -> IntArray:
+    """(M,) number of rows since the last one that begins something, as the first does."""
+    rows = np.arange(len(begins))
+    return rows - np.maximum.accumulate(np.where(begins, rows, 0))
 
 
 def _equal_before(values: Array) -> BoolArray:
@@ -282,13 +300,10 @@ def sort_rows(
     by_session: bool = False,
     held: pa.Table | None = None,
 ) -> SortedRows:
-    """Sort the rows of a log with DuckDB.
+    """Sort the rows of a log with DuckDB, `folder` for scratch (None for a log in memory).
 
-    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
-    `duplicates` is as of `PrepareOptions`, `folder` for scratch (None for a log in memory). With
-    `by_session`, the rows of a session follow each other. Rows whose user, item and time are those
-    of a row of `held` (ids are text) are duplicates. Raises InputError if a reward is too
-    large to train with.
+    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped; those
+    with the user, item and time of a row of `held` (ids are text) are duplicates.
     """
     connection = log.connection
     if held is not None:
@@ -479,11 +494,7 @@ def choose_rows(
 
 def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
-    is the first.
-
-    Other columns decide between rows that are equal to the rule, so that the order of rows and
-    files does not matter; of rows that are equal throughout, it is the first in the files.
-    """
+    is the first: by the rule, then by other columns, so that the order of files does not matter."""
     rewards = rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
     rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}

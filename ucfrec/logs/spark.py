@@ -1,10 +1,8 @@
 """Read and sort the rows of a log with Apache Spark, for logs that outgrow one machine.
 
-Spark's workers read the files, evaluate the columns and the reward with DuckDB (`Task`), so that an
-expression means the same whatever sorts the rows, number the ids and sort: in the scratch folder
-the rows are what DuckDB's sort would give, and what follows is the same. Or each worker gets all
-rows of some users (`map_users`) as one Parquet file, which is read as any other on one machine.
-Workers need ucfrec and the same paths to the logs and the scratch folder.
+Spark's workers read the files, evaluate the columns and the reward with DuckDB (`Task`), number the
+ids and sort: the rows in the scratch folder are what DuckDB's sort would give. Or each worker gets
+all rows of some users (`map_users`) as one Parquet file. Workers need ucfrec and the same paths.
 """
 
 import os

@@ -301,6 +301,9 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             "the user: they count as one list, whose order is unknown and is not learned; log "
             "finer times, or columns request_id and position",
         )
+    if count := rows.repeated_positions:
+        what = "rows repeat a position of their request_id and count as another list"
+        _note(rows, f"{count:,} {what}; give every list an id of its own")
     if report.get("items") == 1:
         _note(
             rows,

@@ -59,6 +59,8 @@ def run_program(module: str) -> int:
         return main()
     finally:
         _handle_signals(signal.SIG_IGN)
+        if atomic := sys.modules.get("ucfrec.files.atomic"):
+            atomic.release_locks()
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:

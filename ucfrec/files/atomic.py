@@ -6,7 +6,6 @@ the lock when the process ends, also when it is killed; whoever gets the lock ne
 scratch is dead, and removes it.
 """
 
-import atexit
 import json
 import os
 import secrets
@@ -152,7 +151,6 @@ def remove_leftovers(folder: Path, within: bool = False) -> None:
         _remove_leftover(file)
 
 
-@atexit.register
 def release_locks() -> None:
     """Remove what interruptions of this process while claims began and ended have left."""
     while _locks:

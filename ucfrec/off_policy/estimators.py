@@ -223,8 +223,9 @@ def cluster_intervals(
     """
     resamples = resample(above, below, cluster, seed)
     intervals: list[Interval | None] = []
-    columns = resamples.value, resamples.error, resamples.studentised.T
-    for value, error, deviations in zip(*columns, strict=True):
+    for value, error, deviations in zip(
+        resamples.value, resamples.error, resamples.studentised.T, strict=True
+    ):
         usable = deviations[np.isfinite(deviations)]
         if len(usable) < _USABLE * RESAMPLES:
             intervals.append(None)

@@ -58,10 +58,8 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_mib() -> float:
-    """Peak resident memory of this process since `reset_peak_memory`, in MiB.
-
-    On systems other than Linux: since the process began.
-    """
+    """Peak resident memory of this process, in MiB, since `reset_peak_memory`; on systems other
+    than Linux, since the process began."""
     status = Path("/proc/self/status")
     if status.exists():
         for line in status.read_text().splitlines():

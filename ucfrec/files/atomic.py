@@ -53,11 +53,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
-
-    Of two processes that write one file, the second waits for the first. InputError if `path` is a
-    folder.
-    """
+    """Yield a scratch path next to `path` that replaces `path` when the block succeeds. Of two
+    processes that write one file, the second waits. InputError if `path` is a folder."""
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
     with claim(path, wait=True):
@@ -99,11 +96,9 @@ def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None
 
 @contextmanager
 def claim(path: Path, wait: bool = False) -> Iterator[bool]:
-    """Try to hold the claim on `path`, which need not exist, or `wait` until it is free.
-
-    A process that holds it already holds it again. Yields whether the claim is held.
-    """
-    key = (os.getpid(), path.parent.resolve() / path.name)
+    """Try to hold the claim on `path`, which need not exist, or `wait` until it is free. A process
+    that holds it already holds it again. Yields whether the claim is held."""
+    key = _key_of(path)
     if key in _held:
         yield True
         return
@@ -153,6 +148,7 @@ def remove_leftovers(folder: Path, within: bool = False) -> None:
 
 def release_locks() -> None:
     """Remove what interruptions of this process while claims began and ended have left."""
+    _held.clear()
     while _locks:
         lock = _locks.pop()
         lock.release(force=True)
@@ -160,9 +156,12 @@ def release_locks() -> None:
 
 
 def _remove_leftover(file: Path) -> None:
+    path = file.with_name(file.name[1 : -len(LOCK)])
+    if _key_of(path) in _held:  # some network file systems give a process its own locks again
+        return
     with suppress(OSError):  # of another user
         if (lock := _acquire(file, 0.0)) is not None:
-            _remove(scratch_of(file.with_name(file.name[1 : -len(LOCK)])))
+            _remove(scratch_of(path))
             _release(lock)
 
 
@@ -171,6 +170,10 @@ def _remove(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)  # a file or link is left
     with suppress(OSError):
         path.unlink()
+
+
+def _key_of(path: Path) -> tuple[int, Path]:
+    return os.getpid(), path.parent.resolve() / path.name
 
 
 def _lock_of(path: Path) -> Path:

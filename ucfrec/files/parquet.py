@@ -22,11 +22,8 @@ _NO_THREAD = "Failed to launch worker thread"
 
 
 def require_plausible_rows(path: Path, rows: int) -> None:
-    """Check that a Parquet file does not unfold into very many equal rows.
-
-    InputError if it claims over a million rows, and over ten for each of its bytes, which can only
-    be repetitions.
-    """
+    """Check that a Parquet file does not unfold into very many equal rows. InputError if it claims
+    over a million rows, and over ten for each of its bytes, which can only be repetitions."""
     size = path.stat().st_size
     if rows > max(_FEW_ROWS, _ROWS_PER_BYTE * size):
         raise InputError(

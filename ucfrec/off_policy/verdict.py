@@ -228,12 +228,12 @@ def list_reasons(diagnosis: Diagnosis) -> list[str]:
         reasons.append("no session has both weight and reward: the logs support no estimate")
     elif count < ENOUGH_REWARDED:
         reasons.append(f"only {count} users have both weight and reward (below {ENOUGH_REWARDED})")
-    elif diagnosis.largest_return > DOMINANT:
+    if diagnosis.largest_weight > DOMINANT:
+        reasons.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
+    elif diagnosis.largest_return > DOMINANT and count >= ENOUGH_REWARDED:
         share = f"{diagnosis.largest_return:.0%} of all weighted reward"
         remedy = "cap rewards, as in least(revenue, 500), or give more logs"
         reasons.append(f"one user has {share}: {remedy}")
-    if diagnosis.largest_weight > DOMINANT:
-        reasons.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
     if (tail := diagnosis.tail or 0.0) > HEAVY_TAIL:
         reasons.append(f"weights have too heavy a tail (Pareto k {tail:.2f}, above {HEAVY_TAIL})")
     return reasons

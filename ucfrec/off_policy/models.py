@@ -63,8 +63,7 @@ class StepInputs:
 
 def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tensor, StepInputs]:
     """The evaluated policy's probability (B,) of the logged item, 0 of an unknown one, and
-    (B, n_items) of all items; and what the models see of the steps.
-    """
+    (B, n_items) of all items; and what the models see of the steps."""
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
     in_catalogue, column = batch.items >= 0, batch.items[:, None].clamp(min=0)
@@ -328,8 +327,7 @@ class ModelReport:
 def fit_models(chunks: Chunks, steps: LoggedSteps, seed: int) -> tuple[Modelled, ModelReport]:
     """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
     by a model that saw it, nor by one that saw another session of its user. What they say of the N
-    steps, and how good they are.
-    """
+    steps, and how good they are."""
     reward, users = steps.reward, int(steps.users.max()) + 1
     fold_of = np.random.default_rng(seed).permutation(users) % min(_RETURN_FOLDS, users)
     folds = fold_of[steps.users][steps.session]

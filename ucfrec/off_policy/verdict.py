@@ -70,7 +70,7 @@ class Diagnosis:
     rewarded_users: int = 0
     """Users with a session that has both weight and reward."""
     largest_return: float = 0.0
-    """Share of one user in all weighted returns, whatever their sign."""
+    """Share of one user in all weighted returns; 0 if none is ten times the mean of those not 0."""
     mean_weight: float | None = None
     """Mean session product, 1 in expectation."""
     tail: float | None = None
@@ -98,7 +98,9 @@ def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
     weighable = steps.weighable
     weights = weighable.session_weights
     by_user = np.bincount(weighable.users, weights).astype(np.float64)
-    rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns)).astype(float)
+    sizes = np.abs(weighable.returns)
+    rewarded = np.bincount(weighable.users, weights * sizes).astype(float)
+    are_uneven = sizes.max() * np.count_nonzero(sizes) > 10 * sizes.sum()
     return Diagnosis(
         sessions=len(incomplete),
         users=users,
@@ -108,7 +110,7 @@ def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
         effective_users=effective_number(by_user),
         largest_weight=largest_share(by_user),
         rewarded_users=int((rewarded > 0).sum()),
-        largest_return=largest_share(rewarded),
+        largest_return=largest_share(rewarded) if are_uneven else 0.0,
         mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
     )

@@ -15,12 +15,7 @@ from tests.support.tagged import tagged_log, tagged_mapping, tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Query, Scorer, logged_scores
 from ucfrec.choosing import by_ranking
-from ucfrec.choosing.by_ranking import (
-    SHOWN,
-    LoggedEvidence,
-    LoggedOutcomes,
-    choose_by_ranking,
-)
+from ucfrec.choosing.by_ranking import SHOWN, LoggedEvidence, LoggedOutcomes, choose_by_ranking
 from ucfrec.choosing.by_simulation import RuleSearch, _batch_rules, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.episodes.states import TrainingCounts, liked_rewards

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.killed_loop import kills
 from tests.support.logs import START
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
@@ -263,6 +264,22 @@ def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -
     note = str(notes[0].message)
     assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note
     assert told in note
+
+
+@pytest.mark.slow
+def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> None:
+    rows = np.arange(200_000)
+    frame = pd.DataFrame({"user_id": (rows % 977).astype(str), "item_id": rows % 83})
+    frame = frame.assign(timestamp=START + rows, request_id=rows.astype(str))
+    (tmp_path / "shown").mkdir()
+    clicked = frame[::7].assign(click=1)
+    clicked.to_parquet(tmp_path / "feedback.parquet")
+    frame = frame.assign(position=1, propensity=0.5, run="r", rule="d")
+    frame.to_parquet(tmp_path / "shown" / "a.parquet")
+    assert kills("join", tmp_path) >= 2
+    log = pd.read_parquet(tmp_path / "joined.parquet")
+    assert (len(log), *log[["click", "feedback"]].sum()) == (len(rows), *2 * [len(clicked)])
+    assert {file.stem for file in tmp_path.glob("*.parquet")} == {"feedback", "joined"}
 
 
 def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:

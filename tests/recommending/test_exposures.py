@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.killed import kills
+from tests.support.killed_loop import kills
 from tests.support.served import histories, requests_of, responder, tagged_log, with_rule
 from ucfrec import Recommender
 from ucfrec.commands.cli import main

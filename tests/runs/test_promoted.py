@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.killed import kills
+from tests.support.killed_loop import kills
 from tests.support.served import trained_run
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError

@@ -11,7 +11,7 @@ import torch
 
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
-from tests.support.killed import kills
+from tests.support.killed_loop import kills
 from tests.support.tensors import assert_same_tensors
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore

@@ -28,11 +28,6 @@ class UnexplainedError(Exception):
 
 
 @contextmanager
-def _write_in_place(path: Path) -> Iterator[Path]:
-    yield path
-
-
-@contextmanager
 def _claim_nothing(path: Path, wait: bool = False) -> Iterator[bool]:
     path.parent.mkdir(parents=True, exist_ok=True)
     yield True
@@ -103,7 +98,7 @@ _READERS: dict[str, Mutant] = {
     "hopper.hdf5 alone": ("_control.data.d4rl.open_hdf5", h5py.File),
 }
 MUTANTS: dict[tuple[str, str], Mutant] = {
-    **{("kills", job): (".files.atomic._scratch", _write_in_place) for job in _JOBS},
+    **{("kills", job): (".files.atomic._clear_scratch", lambda path: path) for job in _JOBS},
     ("interruptions", "collect"): (".files.atomic._remove", lambda _: None),
     ("pairs", "prepare"): (".files.atomic.claim", _claim_nothing),
     ("flips", "store"): _UNCHECKED,

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.support.killed import kills
+from tests.support.killed_loop import kills
 from tests.support.later import NEW, later_log, later_mapping
 from tests.support.served import SETTINGS, trained_run
 from tests.support.tagged import ITEMS, tagged_log, tagged_store

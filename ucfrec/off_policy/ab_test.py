@@ -169,7 +169,7 @@ class _Means:
     def check(self, guardrail: Guardrail, reasons: Sequence[str]) -> Guardrail:
         """The change of the second arm, as a share of the first."""
         (a, b), (error_a, error_b) = self.values, self.errors
-        faults = (*reasons, *self.list_faults(), *["its mean is not above 0"] * (a <= 0))
+        faults = (*reasons, *self.list_faults(), *(["its mean is not above 0"] if a <= 0 else []))
         if faults:
             return replace(guardrail, change=Evidence(None, None, None, faults))
         variance = (error_b / a) ** 2 + (b * error_a / a**2) ** 2

@@ -262,8 +262,7 @@ def conclude(
 ) -> Verdict:
     """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing else
     is `forbidden`. `wanted_lift` is the return per session that a launch should gain; None for 5%
-    of the mean logged. `days` are those from the first session to the last.
-    """
+    of the mean logged. `days` are those from the first session to the last."""
     diagnosis = diagnosis or diagnose(steps)
     reasons = [*forbidden, *list_reasons(diagnosis)]
     if wanted_lift is None:

@@ -238,8 +238,7 @@ def _make_report(
     options: EstimateOptions,
 ) -> OffPolicyReport:
     """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
-    mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
-    """
+    mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step."""
     steps, diagnosis, verdict = _conclude_lists(logs, seed, options)
     weighable = None if steps.lacking.all() else steps.weighable
     verdict, terms = _add_evidence(logs, steps, diagnosis, verdict, seed, options)

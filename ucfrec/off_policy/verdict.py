@@ -28,6 +28,8 @@ LEAST_SHOWN = 0.01
 """Share of the evaluated policy's choices below which an item group is not tested."""
 DOMINANT = 0.1
 """Largest share of one user in all weight."""
+LARGE = 10.0
+"""Returns of so many times the mean of those that are not 0 make a sum of rewards uneven."""
 HEAVY_TAIL = 0.5
 """Pareto shape from which on the variance is infinite, and no interval means anything."""
 FAR_OFF = 0.1
@@ -70,7 +72,7 @@ class Diagnosis:
     rewarded_users: int = 0
     """Users with a session that has both weight and reward."""
     largest_return: float = 0.0
-    """Share of one user in all weighted returns; 0 if none is ten times the mean of those not 0."""
+    """Largest share of one user in the weighted returns; 0 if no return is `LARGE`."""
     mean_weight: float | None = None
     """Mean session product, 1 in expectation."""
     tail: float | None = None
@@ -100,7 +102,7 @@ def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
     by_user = np.bincount(weighable.users, weights).astype(np.float64)
     sizes = np.abs(weighable.returns)
     rewarded = np.bincount(weighable.users, weights * sizes).astype(float)
-    are_uneven = sizes.max() * np.count_nonzero(sizes) > 10 * sizes.sum()
+    are_uneven = sizes.max() * np.count_nonzero(sizes) > LARGE * sizes.sum()
     return Diagnosis(
         sessions=len(incomplete),
         users=users,

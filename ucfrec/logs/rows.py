@@ -252,7 +252,7 @@ def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str
     if positions is not None:
         decisions = np.cumsum(begins)
         # Rows without a position repeat none. Complex numbers sort by their real parts first.
-        positions = np.where(np.isfinite(positions), positions, ~np.arange(len(times)))
+        positions = np.where(np.isfinite(positions), positions, -0.5 - np.arange(len(times)))
         keys = decisions + 1j * positions
         order = keys.argsort(kind="stable")
         first = np.append(True, ~_equal_before(keys[order]))

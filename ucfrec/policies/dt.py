@@ -73,7 +73,7 @@ class DTPolicy(SequencePolicy):
         mask: Tensor,
         rows: slice | None = None,
     ) -> Tensor:
-        """Outputs (B, 3K, d) at R_0, s_0, a_0, R_1, … or `rows`; `mask` (B, K) is false at padding."""
+        """Outputs (B, 3K, d) at R_0, s_0, a_0, R_1, … or `rows`; `mask` (B, K) excludes padding."""
         hidden = self.dropout(interleave(tokens))
         visible = visible_tokens(mask.repeat_interleave(3, dim=1))
         return self.final_norm(pass_rows(self.blocks, hidden, visible, rows))  # type: ignore[no-any-return]

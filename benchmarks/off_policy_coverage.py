@@ -49,7 +49,7 @@ from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec_simulators.session_env import draw_categories
 
-SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
+SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "REG", "lift")
 LOW, HIGH = 0.90, 0.98
 MOST_WRONG = 0.05
 """Share of verdicts that may stand where intervals do not hold."""

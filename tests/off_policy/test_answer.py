@@ -88,7 +88,7 @@ def test_steps_answer_where_sessions_cannot() -> None:
     assert verdict.answer == "the log cannot say"
     verdict = replace(verdict, per_step=conclude(cut_to_steps(steps), 0))
     assert verdict.answer == "test it"
-    assert "per step, by DR" in verdict.headline
+    assert "per step, by REG" in verdict.headline
     assert "per session: – (" in verdict.list_lines()[1]
     bad = replace(steps, target=TARGET[::-1][items])
     assert replace(verdict, per_step=conclude(cut_to_steps(bad), 0)).answer == "do not launch"

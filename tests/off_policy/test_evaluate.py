@@ -114,7 +114,7 @@ def test_the_lift_is_over_the_same_steps_as_logged() -> None:
     steps = random_logs(1)
     known = ~np.isnan(steps.propensity)
     found = conclude(cut_to_steps(steps), 0)
-    assert found.estimator == "DR"
+    assert found.estimator == "REG"
     assert found.logged == pytest.approx(steps.reward[known].mean())
     wrong = conclude(cut_to_steps(random_logs(2, wrong=0.5)), 0)
     assert any("where 1 is expected" in reason for reason in wrong.reasons)

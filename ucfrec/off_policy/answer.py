@@ -12,6 +12,7 @@ from ucfrec.off_policy.estimators import (
     NO_INTERVAL,
     NO_SPREAD,
     Estimate,
+    Interval,
     cluster_intervals,
     cluster_mean,
     session_terms,
@@ -30,8 +31,10 @@ from ucfrec.results.evidence import Evidence
 
 DAY_MS = 86_400_000
 Answer: TypeAlias = Literal["launch", "test it", "do not launch", "the log cannot say"]
-BEST_FIRST = ("DR", "SNPDIS")
+BEST_FIRST = ("REG", "SNPDIS")
 """The estimator that a verdict is about: the first of these that there is."""
+_ROUNDING = 1e-4
+"""Largest lift of a session, in mean returns, that the behavior policy itself may seem to have."""
 MOST_LINES = 15
 """Lines of an answer."""
 _DETECTED = 1.96 + 0.84
@@ -194,8 +197,8 @@ class Verdict:
         says, rests_on = self.answer, f" ({self.declared})" if self.declared else ""
         if says == "the log cannot say":
             return f"{says}: {self.reasons[0]}{rests_on}"
-        if not self.lift.is_reliable and self.per_step is not None:
-            return f"{says}: {self.per_step.lift.format()} per step, by DR{rests_on}"
+        if not self.lift.is_reliable and (step := self.per_step) is not None:
+            return f"{says}: {step.lift.format()} per step, by {step.estimator}{rests_on}"
         share = self.lift.value / abs(self.logged) if self.lift.value and self.logged else 0.0
         why = f", less than the wanted gain of {self.wanted_lift:.3g}"
         if self.lift.standing() in ("better", "worse"):
@@ -271,10 +274,13 @@ def conclude(
     name = next((name for name in BEST_FIRST if name in terms), None)
     value = interval = None
     if name is not None:
-        lifts = terms[name].influences - steps.weighable.returns
+        returns = steps.weighable.returns
+        lifts = terms[name].influences - returns
         value, ones = float(lifts.mean()), np.ones((len(lifts), 1))
         (interval,) = cluster_intervals(lifts[:, None], ones, steps.weighable.user, seed)
-        if interval is None:
+        if np.allclose(lifts, 0.0, atol=_ROUNDING * np.abs(returns).mean()):
+            value, interval = 0.0, Interval(0.0, 0.0, 0.0)
+        elif interval is None:
             reasons += NO_SPREAD.reasons
     low, high, _ = interval or NO_INTERVAL
     return Verdict(

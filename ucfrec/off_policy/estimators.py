@@ -14,6 +14,7 @@ w_i that of the whole session, E_n the mean over sessions.
 | SNPDIS | Σ_t γ^t E_n[w_it r_it] / E_n[w_it] | weighted PDIS: Precup 2000; Thomas 2015 |
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
+| REG | SNPDIS + λ (SNDR − SNPDIS), λ fitted | Kallus & Uehara, NeurIPS 2019, section 4 |
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
 step, as if it went on without reward (Thomas & Brunskill 2016).
@@ -122,7 +123,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     per_decision = steps.per_session(steps.discounts * weights * steps.reward)
     terms = {
         "PDIS": Terms(per_decision, ones, last),
-        "SNPDIS": Terms(estimate_by_step(steps), ones, last),
+        "SNPDIS": Terms(normalise_by_step(steps, steps.reward), ones, last),
     }
     if steps.model is not None:
         q, v = steps.model.q, steps.model.v
@@ -133,6 +134,9 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         corrected = weights * left + steps.weights_before * v
         terms["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
         terms["SNDR"] = Terms(normalise_by_step(steps, left, v), ones, last)
+        plain, control = terms["SNPDIS"].above, terms["SNDR"].above - terms["SNPDIS"].above
+        coefficient = fit_coefficient(plain - steps.returns, control, steps.users)
+        terms["REG"] = Terms(plain + coefficient * control, ones, last)
     if steps.place is not None:
         return terms
     terms["IPS"] = Terms(last * steps.returns, ones, last)
@@ -140,15 +144,15 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     return terms
 
 
-def estimate_by_step(steps: LoggedSteps) -> Float64Array:
-    """(S,) whose mean is SNPDIS, and whose spread is its error to first order."""
-    return normalise_by_step(steps, steps.reward, None)
+def fit_coefficient(lift: Float64Array, control: Float64Array, user: IntArray) -> float:
+    """λ in [0, 1] for which the mean of lift + λ control, (S,) each, has the least variance over
+    users (S,): 0 for the behavior policy itself, where the control is mere noise of a model."""
+    lifts, controls = (np.bincount(user, values - values.mean()) for values in (lift, control))
+    return float(np.clip(-(lifts @ controls) / max(controls @ controls, 1e-300), 0.0, 1.0))
 
 
 def normalise_by_step(
-    steps: LoggedSteps,
-    left: Float64Array,
-    v: Float64Array | None,
+    steps: LoggedSteps, left: Float64Array, v: Float64Array | None = None
 ) -> Float64Array:
     """(S,) estimate plus influence (the derivative by a session's share) of each session.
 

@@ -106,7 +106,7 @@ class OffPolicyReport(ResultTable):
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
     models: ModelReport
-    """How good the models of DM, FQE and DR are."""
+    """How good the models of DM, FQE, DR and REG are."""
     returns: Float64Array
     """(S,) of the logged sessions with all their propensities; empty if none has."""
     user: IntArray | None

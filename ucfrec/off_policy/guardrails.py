@@ -12,7 +12,7 @@ from ucfrec.off_policy.estimators import (
     NO_INTERVAL,
     NO_SPREAD,
     cluster_intervals,
-    estimate_by_step,
+    normalise_by_step,
     simultaneous_intervals,
 )
 from ucfrec.off_policy.logged_steps import LoggedSteps, merge_lists
@@ -99,7 +99,7 @@ def check_guardrail(
         reasons = list_reasons(diagnose(measured))
     if not reasons:
         logged = measured.returns
-        changes = estimate_by_step(measured) - logged
+        changes = normalise_by_step(measured, measured.reward) - logged
         if logged.sum() <= 0:
             reasons = ["its mean is not above 0"]
         else:
@@ -121,7 +121,8 @@ def compare_groups(
         if groups.of_items:
             rewards = np.where(groups.number == number, steps.reward, 0.0)
             part = _weigh(steps, rewards)
-            above, inside = estimate_by_step(part) - part.returns, np.ones(len(lifts), dtype=bool)
+            inside = np.ones(len(lifts), dtype=bool)
+            above = normalise_by_step(part, part.reward) - part.returns
         else:
             inside = groups.number[steps.first][~steps.lacking] == number
             above = lifts * inside

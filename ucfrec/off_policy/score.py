@@ -99,12 +99,9 @@ def read_logged_sessions(
     this context manager ends. InputError if the policy's actions are vectors, the logs cannot be
     used, none of their items is known, or their observations are not those of the training logs.
 
-    Args:
-        mapping: which columns mean what; what it leaves open is as in the training logs.
-        keep_unknown: keep rows whose item the run does not know, as item −1; else they are dropped
-            and counted in the report.
-        measures: expressions over the columns of the logs to read, too.
-        by: column to group users or items by.
+    What `mapping` leaves open is as in the training logs. Rows whose item the run does not know are
+    kept as item −1 if `keep_unknown`, or else dropped and counted in the report. `measures` are
+    expressions over the columns of the logs to read, too; `by` is one to group users or items by.
     """
     require_items(trained)
     record, mapping = trained.record, columns_used(trained, mapping)
@@ -239,10 +236,9 @@ def score(
     """Compute the policy's probability of every logged choice, given those before it in its list,
     under its own rule or another, in logs without unknown items.
 
-    Yields:
-        Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
-        (from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (if logged), `probability` of
-        the logged item, its `rank` (from 1) among all, and `greedy_item_id`, the best one.
+    The frames have one row a logged step, in order of user, session and time: `user_id`, `session`
+    (from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (if logged), `probability` of the
+    logged item, its `rank` (from 1) among all, and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.items.ids
     for batch in score_steps(trained, store, logged.rows, rule):

@@ -96,7 +96,7 @@ def select(
     """Rank K candidates by estimates on the same sessions.
 
     Args:
-        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR;
+        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of REG;
             InputError if shapes differ or one is not finite.
         user: (S,) whose session each is; None where each is of another user.
     """

@@ -11,7 +11,12 @@ from tests.support.logged_steps import random_steps
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, conclude, estimate
 from ucfrec.off_policy.logged_steps import ItemGroups
-from ucfrec.off_policy.verdict import check_catalogue_size, diagnose, pareto_tail
+from ucfrec.off_policy.verdict import (
+    check_catalogue_size,
+    describe_rounding,
+    diagnose,
+    pareto_tail,
+)
 
 ITEMS = 10
 PAYS = np.linspace(0.1, 0.5, ITEMS)
@@ -37,6 +42,13 @@ def logs(
 
 def value(length: int = 1) -> float:
     return length * float(TARGET @ PAYS)
+
+
+def test_propensities_of_few_decimals_are_noticed() -> None:
+    text = describe_rounding(np.append(np.arange(1, 13) / 100, np.nan))
+    assert "have 2 decimals: if they were rounded, weights are wrong by up to 50%;" in text
+    for exact in (np.arange(1, 40) / 780, np.array([0.91, 0.01, 0.01]), 1 / np.arange(1, 40)):
+        assert describe_rounding(exact) == ""
 
 
 def test_good_logs_stand_and_say_what_the_policy_gains() -> None:

@@ -2,16 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from ucfrec.off_policy.estimators import (
-    LOGGED,
     NO_INTERVAL,
     NO_SPREAD,
-    Estimate,
     Interval,
     cluster_intervals,
     cluster_mean,
@@ -135,23 +133,12 @@ def cut_to_steps(steps: LoggedSteps) -> LoggedSteps | None:
     )
 
 
-def add_reasons(estimates: dict[str, Estimate], reasons: Sequence[str]) -> dict[str, Estimate]:
-    """The estimates, those that weigh with the reasons against their weights."""
-    return {
-        name: result
-        if name == LOGGED or result.reasons
-        else replace(result, reasons=tuple(reasons))
-        for name, result in estimates.items()
-    }
-
-
 @dataclass(frozen=True)
 class Verdict:
     """What the logs say of the evaluated policy against the behavior policy."""
 
     lift: Evidence
-    """Of its value over the mean return as logged, on the same sessions; the interval is
-    studentised, clustered by user."""
+    """Of its value over the mean return as logged, on the same sessions; clustered by user."""
     estimator: str | None
     """Which estimate the lift is of; None where nothing could be weighed."""
     logged: float
@@ -176,8 +163,7 @@ class Verdict:
 
     @property
     def answer(self) -> Answer:
-        """What to do with the policy: a launch needs a gain and every guardrail, a test a chance of
-        the wanted lift."""
+        """What to do: a launch needs a gain and every guardrail, a test a chance of the lift."""
         evidence, outcomes = self.lift, {guardrail.outcome for guardrail in self.guardrails}
         if not evidence.is_reliable and self.per_step is not None:
             evidence = self.per_step.lift
@@ -263,9 +249,9 @@ def conclude(
     declared: str = "",
     days: float | None = None,
 ) -> Verdict:
-    """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing else
-    is `forbidden`. `wanted_lift` is the return per session that a launch should gain; None for 5%
-    of the mean logged. `days` are those from the first session to the last."""
+    """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing is
+    `forbidden`. A launch should gain `wanted_lift` per session, by default 5% of the mean logged
+    return. `days` are those from the first session to the last."""
     diagnosis = diagnosis or diagnose(steps)
     reasons = [*forbidden, *list_reasons(diagnosis)]
     if wanted_lift is None:

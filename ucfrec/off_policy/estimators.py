@@ -14,7 +14,7 @@ w_i that of the whole session, E_n the mean over sessions.
 | SNPDIS | Σ_t γ^t E_n[w_it r_it] / E_n[w_it] | weighted PDIS: Precup 2000; Thomas 2015 |
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
-| REG | SNPDIS + λ (SNDR − SNPDIS), λ fitted | Kallus & Uehara, NeurIPS 2019, section 4 |
+| REG | SNPDIS + λ (SNDR − SNPDIS), λ fitted | after Kallus & Uehara, NeurIPS 2019 |
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
 step, as if it went on without reward (Thomas & Brunskill 2016).
@@ -72,12 +72,12 @@ class Terms:
         return np.asarray(value + (self.above - value * self.below) / self.below.mean())
 
 
-def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
+def estimate(steps: LoggedSteps, seed: int, reasons: tuple[str, ...] = ()) -> dict[str, Estimate]:
     """Mean return per session as logged, and under the evaluated policy; `seed` draws resamples.
 
     DM, FQE and the doubly robust need `steps.model`; all that weigh leave out sessions with a step
     of unknown propensity, which is right where propensities are lost at random, and are omitted
-    where no session has any weight.
+    where no session has any weight. `reasons` are those against all that weigh.
     """
     ones = np.ones(len(steps.first))
     terms = {LOGGED: Terms(steps.returns, ones, ones)}
@@ -85,13 +85,18 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
         terms["DM"] = Terms(modelled, ones, ones, doubt=_OF_MODEL)
         terms["FQE"] = Terms(steps.model.v[steps.first], ones, ones, doubt=_OF_MODEL)
-    estimates = summarise(terms, steps.user, seed)
+    estimates = _summarise(terms, steps.user, seed, ())
     if not steps.lacking.all() and (terms := session_terms(steps.weighable)):
-        estimates |= summarise(terms, steps.weighable.user, seed)
+        estimates |= _summarise(terms, steps.weighable.user, seed, reasons)
     return estimates
 
 
-def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
+def _summarise(
+    terms: Mapping[str, Terms],
+    user: IntArray | None,
+    seed: int,
+    reasons: tuple[str, ...],
+) -> dict[str, Estimate]:
     """Estimates with intervals, of terms of S units, each of a user (S,), by estimator."""
     above, below = np.stack([(term.above, term.below) for term in terms.values()], axis=2)
     estimates, intervals = {}, cluster_intervals(above, below, user, seed)
@@ -101,7 +106,7 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
             value=float(term.above.sum() / term.below.sum()),
             low=low,
             high=high,
-            reasons=(term.doubt,) if term.doubt else (),
+            reasons=(term.doubt,) if term.doubt else reasons,
             error=error,
             effective_sessions=effective_number(term.weights),
             largest_weight=largest_share(term.weights),
@@ -120,9 +125,8 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if not last.any():
         return {}
     ones = np.ones(len(last))
-    per_decision = steps.per_session(steps.discounts * weights * steps.reward)
     terms = {
-        "PDIS": Terms(per_decision, ones, last),
+        "PDIS": Terms(steps.per_session(steps.discounts * weights * steps.reward), ones, last),
         "SNPDIS": Terms(normalise_by_step(steps, steps.reward), ones, last),
     }
     if steps.model is not None:
@@ -148,7 +152,8 @@ def fit_coefficient(lift: Float64Array, control: Float64Array, user: IntArray) -
     """λ in [0, 1] for which the mean of lift + λ control, (S,) each, has the least variance over
     users (S,): 0 for the behavior policy itself, where the control is mere noise of a model."""
     lifts, controls = (np.bincount(user, values - values.mean()) for values in (lift, control))
-    return float(np.clip(-(lifts @ controls) / max(controls @ controls, 1e-300), 0.0, 1.0))
+    variance = float(controls @ controls)
+    return float(np.clip(-float(lifts @ controls) / variance, 0.0, 1.0)) if variance else 0.0
 
 
 def normalise_by_step(
@@ -213,17 +218,14 @@ def cluster_intervals(
     cluster: IntArray | None,
     seed: int,
 ) -> list[Interval | None]:
-    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below, one per column; None
-    where more than a tenth of the resamples have no spread.
+    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below, of values (S, K) with a
+    column each; None where more than a tenth of the resamples have no spread.
 
     Clusters are drawn with replacement, each with all its sessions (Cameron, Gelbach & Miller,
     Review of Economics and Statistics 2008), and every resample's deviation is divided by its own
     standard error (Efron & Tibshirani 1993, section 12.5): where a few heavy weights carry the sum,
-    value and error rise and fall together, which percentiles of the value alone miss.
-
-    Args:
-        above: (S, K), one row per session, one column per estimate; as `below`.
-        cluster: (S,) of each session, any integers; None where each session is its own.
+    value and error rise and fall together, which percentiles of the value alone miss. `cluster`
+    (S,) has any integers; None where each session is its own.
     """
     resamples = resample(above, below, cluster, seed)
     intervals: list[Interval | None] = []
@@ -271,8 +273,7 @@ class Resamples:
     shift: Float64Array
     """(B, K) of each resample: its ratio less `value`."""
     studentised: Float64Array
-    """(B, K) `shift` in standard errors of the resample; NaN where it has no spread, as in all
-    where clusters do not differ."""
+    """(B, K) `shift` in standard errors of the resample; NaN where clusters do not differ."""
 
 
 def resample(

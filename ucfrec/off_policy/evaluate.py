@@ -19,7 +19,6 @@ from ucfrec.off_policy.answer import (
     MOST_LINES,
     Traffic,
     Verdict,
-    add_reasons,
     conclude,
     cut_to_steps,
 )
@@ -41,6 +40,7 @@ from ucfrec.off_policy.verdict import (
     MOST_LEFT_OUT,
     Diagnosis,
     check_catalogue_size,
+    describe_rounding,
     diagnose,
 )
 from ucfrec.provenance import config_hash, provenance, shorten_paths
@@ -244,8 +244,8 @@ def _make_report(
     verdict, terms = _add_evidence(logs, steps, diagnosis, verdict, seed, options)
     of_steps: dict[str, Estimate] = {}
     if verdict.per_step is not None and (single := cut_to_steps(logs.steps)) is not None:
-        of_steps = add_reasons(estimate(single, seed), verdict.per_step.reasons)
-    estimates = add_reasons(estimate(steps, seed), verdict.reasons)
+        of_steps = estimate(single, seed, verdict.per_step.reasons)
+    estimates = estimate(steps, seed, verdict.reasons)
     if not logs.models.converged:
         diverged = "it diverged: its values exceed the largest possible return"
         estimates["FQE"] = replace(estimates["FQE"], reasons=(diverged,))
@@ -305,8 +305,8 @@ def _conclude_lists(
     seed: int,
     options: EstimateOptions,
 ) -> tuple[LoggedSteps, Diagnosis, Verdict]:
-    """The steps as the weakest assumption on the positions of lists has them of which the logs have
-    enough, or else as a cascade; with what is concluded under it, beside what is under others.
+    """The steps, diagnosis and verdict under the weakest assumption on lists that the logs support,
+    or else of a cascade; a remark shows the verdicts under the others.
 
     Independent positions never decide: given the items above it, the ratio of a position leaves out
     how those change what is left to show, so that its interval covers too seldom.
@@ -407,6 +407,8 @@ def _doubt_logs(logs: WeighedLogs) -> None:
             "the store of the run is gone or has changed: whether these logs were seen in training "
             "is not known, and users begin without a history; move the run together with its store"
         )
+    if text := describe_rounding(logs.steps.propensity):
+        logs.remarks.append(text)
     if logged.unknown_items:
         logs.remarks.append(
             f"{logged.unknown_items:,} rows show items that the run does not know, and so never "

@@ -59,10 +59,8 @@ def read_groups(
     ids: dict[str, tuple[Array, IntArray]],
 ) -> Groups:
     """Groups by a column of a feature table, or by one of the logs that has one value per user, or
-    per item. InputError if there is no such column, or it has too many values, or several per id.
-
-    Args:
-        ids: of USER_ID and ITEM_ID: (n,) the ids, and (N,) the place there of each step's.
+    per item. `ids` of USER_ID and ITEM_ID are (n,) the ids, and (N,) the place there of each
+    step's. InputError if there is no such column, or it has too many values, or several per id.
     """
     folder = options.temp_folder or files[0].parent
     parts = (part for tables in feature_tables(mapping).values() for part in tables)

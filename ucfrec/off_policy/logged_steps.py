@@ -197,8 +197,7 @@ class LoggedSteps:
 
     @cached_property
     def session_weights(self) -> Float64Array:
-        """(S,) w of each session's last step: the product of all its ratios; with lists, the mean
-        weight of its steps."""
+        """(S,) w of each session's last step, of all its ratios; with lists, the steps' mean."""
         if self.place is None:
             return self.weights[self.last]
         return self.per_session(self.weights) / self.lengths
@@ -305,9 +304,8 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
 
 
 def merge_lists(steps: LoggedSteps) -> LoggedSteps:
-    """Every decision as one step: its rewards summed, the probability of its list the product of
-    those of the positions. Models of the return are those of the first position; those of the
-    reward are summed."""
+    """Every decision as one step: its rewards, observed and modelled, summed, its probabilities
+    multiplied. Models of the return are those of the first position."""
     starts = np.flatnonzero(np.diff(steps.decision, prepend=-1))
     add, multiply = (partial(of.reduceat, indices=starts) for of in (np.add, np.multiply))
     model = steps.model and Modelled(

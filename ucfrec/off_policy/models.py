@@ -161,8 +161,7 @@ class BehaviorModel:
     share_log_loss: float
     """The same of the groups' shares in the logs, which ignore the state."""
     calibration_error: float
-    """Mean absolute difference between what is predicted and what occurs, over groups and tenths
-    of the predicted probability."""
+    """Mean absolute error of predicted shares, over groups and tenths of the probability."""
 
     def __str__(self) -> str:
         return (
@@ -325,9 +324,8 @@ class ModelReport:
 
 
 def fit_models(chunks: Chunks, steps: LoggedSteps, seed: int) -> tuple[Modelled, ModelReport]:
-    """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
-    by a model that saw it, nor by one that saw another session of its user. What they say of the N
-    steps, and how good they are."""
+    """Fit linear models of reward and Q, cross-fitted over at least two users: no model predicts
+    sessions of users that it saw. Their predictions of the N steps, and how good they are."""
     reward, users = steps.reward, int(steps.users.max()) + 1
     fold_of = np.random.default_rng(seed).permutation(users) % min(_RETURN_FOLDS, users)
     folds = fold_of[steps.users][steps.session]

@@ -93,12 +93,9 @@ def select(
     seed: int,
     user: IntArray | None = None,
 ) -> Selection:
-    """Rank K candidates by estimates on the same sessions.
-
-    Args:
-        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of REG;
-            InputError if shapes differ or one is not finite.
-        user: (S,) whose session each is; None where each is of another user.
+    """Rank K candidates by estimates on the same sessions: the means of `terms` (S, K), such as
+    `influences` of REG, of sessions of `user` (S,), or of a user each (None). InputError if shapes
+    differ or a number is not finite.
     """
     if terms.ndim != 2 or terms.shape[1] != len(names) or not len(names) or not len(terms):
         raise InputError(f"terms have shape {terms.shape}; give a column to each of {len(names)}")
@@ -156,9 +153,8 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
 
 
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
-    """Names that say what differs among candidates, of what each is made of, e.g. "target return 5,
-    greedy". Candidates that differ have different names: numbers have the digits that distinguish
-    them."""
+    """Names of candidates by the parts in which they differ, e.g. "target return 5, greedy", with
+    as many digits as distinguish them."""
     differing = [
         key for key in candidates[0] if len({str(parts[key]) for parts in candidates}) > 1
     ] or list(candidates[0])[:1]

@@ -36,6 +36,8 @@ FAR_OFF = 0.1
 """Distance of a mean session weight from 1 that counts, though no test may show it."""
 MOST_LEFT_OUT = 0.05
 """Largest share of sessions, or rows, without which an estimate stands."""
+_MANY_VALUES = 10
+"""Different propensities that few decimals do not have by design."""
 _SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
 SESSION_PRODUCTS = "session products"
 
@@ -92,8 +94,7 @@ class Diagnosis:
 
 
 def diagnose(steps: LoggedSteps, segment: IntArray | None = None) -> Diagnosis:
-    """Look for what forbids an estimate; each segment (S,) of sessions, of users or weeks, is
-    tested alone."""
+    """Look for what forbids an estimate; each segment (S,) of sessions is tested alone."""
     incomplete, users = steps.lacking, int(steps.users.max()) + 1
     if incomplete.all():
         return Diagnosis(len(incomplete), users, left_out=len(incomplete))
@@ -165,6 +166,21 @@ def _iterate_weights(
         if len(np.unique(step_user[inside])) >= ENOUGH_TO_TEST and share >= LEAST_SHOWN:
             beyond = (np.where(inside, ratios, 0.0) - target) / share
             yield f"item group {number}", 1 + beyond, step_user
+
+
+def describe_rounding(propensity: Float64Array) -> str:
+    """What to say of propensities (N,) with few decimals and yet many values; "" of others."""
+    for decimals in (1, 2, 3):
+        rounded = np.round(propensity, decimals)
+        if not np.allclose(rounded, propensity, rtol=0, atol=1e-6, equal_nan=True):
+            continue
+        if len(np.unique(rounded)) < _MANY_VALUES:
+            break
+        return (
+            f"propensities have {decimals} decimals: if they were rounded, weights are wrong by up "
+            f"to {0.5 * 0.1**decimals / np.nanmin(propensity):.0%}; log all digits"
+        )
+    return ""
 
 
 def check_catalogue_size(

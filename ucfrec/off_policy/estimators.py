@@ -75,9 +75,8 @@ class Terms:
 def estimate(steps: LoggedSteps, seed: int, reasons: tuple[str, ...] = ()) -> dict[str, Estimate]:
     """Mean return per session as logged, and under the evaluated policy; `seed` draws resamples.
 
-    DM, FQE and the doubly robust need `steps.model`; all that weigh leave out sessions with a step
-    of unknown propensity, which is right where propensities are lost at random, and are omitted
-    where no session has any weight. `reasons` are those against all that weigh.
+    Those with models need `steps.model`. Those that weigh leave out sessions with a step of unknown
+    propensity, need any weight, and get the `reasons` against them.
     """
     ones = np.ones(len(steps.first))
     terms = {LOGGED: Terms(steps.returns, ones, ones)}
@@ -97,7 +96,7 @@ def _summarise(
     seed: int,
     reasons: tuple[str, ...],
 ) -> dict[str, Estimate]:
-    """Estimates with intervals, of terms of S units, each of a user (S,), by estimator."""
+    """Estimates with intervals by estimator, of sessions (S,) of `user` (S,)."""
     above, below = np.stack([(term.above, term.below) for term in terms.values()], axis=2)
     estimates, intervals = {}, cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):

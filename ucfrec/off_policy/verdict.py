@@ -172,14 +172,12 @@ def describe_rounding(propensity: Float64Array) -> str:
     """What to say of propensities (N,) with few decimals and yet many values; "" of others."""
     for decimals in (1, 2, 3):
         rounded = np.round(propensity, decimals)
-        if not np.allclose(rounded, propensity, rtol=0, atol=1e-6, equal_nan=True):
-            continue
-        if len(np.unique(rounded)) < _MANY_VALUES:
-            break
-        return (
-            f"propensities have {decimals} decimals: if they were rounded, weights are wrong by up "
-            f"to {0.5 * 0.1**decimals / np.nanmin(propensity):.0%}; log all digits"
-        )
+        if np.allclose(rounded, propensity, rtol=0, atol=1e-6, equal_nan=True):
+            if len(np.unique(rounded)) < _MANY_VALUES:
+                return ""
+            error = 0.5 * 0.1**decimals / np.nanmin(propensity)
+            text = f"propensities have {decimals} decimals: if they were rounded, weights are wrong"
+            return f"{text} by up to {error:.0%}; log all digits"
     return ""
 
 

@@ -292,9 +292,8 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs (or a single one), each once.
 
     A folder stands for all log files in it and its sub-folders, by name, but for stores, runs, and
-    those whose names begin with a dot or an underscore. Sets of candidates are no logs, and left
-    out beside some. Raises InputError if a path is missing,
-    matches no log file, or is a file of another kind.
+    those whose names begin with a dot or an underscore. Beside logs, sets of candidates are not
+    listed. InputError if a path is missing, matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
     # A text is a sequence of texts, too: its characters.

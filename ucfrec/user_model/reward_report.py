@@ -18,8 +18,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.reward import PLACES, ItemRewardModel
 
 _BINS = 10
-_CHUNK = 16_384
-_READ_AT_ONCE = 16_384
+_AT_ONCE = 16_384
 _LARGEST_WEIGHT = 10.0
 """Larger weights are cut off, so that no single row decides."""
 SAVED = ConfigDict(extra="forbid")
@@ -74,8 +73,8 @@ class RewardRows:
     ) -> "RewardRows":
         """The given steps (M,) of a view, with the latest `lags` items shown before them."""
         states = torch.empty(len(steps), view.state_size)
-        for start in range(0, len(steps), _READ_AT_ONCE):
-            part = slice(start, start + _READ_AT_ONCE)
+        for start in range(0, len(steps), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
         users = np.full(view.n_episodes, -1)
         if view.has_users:
@@ -204,7 +203,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.above[part],
             None if sums is None else sums[part],
         )
-        for part in torch.split(torch.arange(len(rows)), _CHUNK)
+        for part in torch.split(torch.arange(len(rows)), _AT_ONCE)
     ]
     return torch.cat(scores)
 

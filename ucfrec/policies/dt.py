@@ -147,8 +147,9 @@ def attend(
 ) -> Tensor:
     """Scaled dot-product attention (B, M, d) of queries (B, M, d) to keys and values (B, L, d) that
     are `visible` (B, 1, M, L), some in each row; drops weights as `Dropout`."""
+    size = query.shape[0], -1, heads, query.shape[2] // heads
     # (B, L, d) -> (B, H, L, d/H)
-    query, key, value = (x.unflatten(2, (heads, -1)).transpose(1, 2) for x in (query, key, value))
+    query, key, value = (x.view(size).transpose(1, 2) for x in (query, key, value))
     if dropout == 0 or query.device.type != "cpu":
         mixed = F.scaled_dot_product_attention(query, key, value, visible, dropout)
     else:

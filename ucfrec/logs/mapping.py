@@ -88,13 +88,11 @@ class LogMapping:
     reward: str | None = None
     """SQL expression of the reward; `PrepareOptions.reward` overrides it."""
     session_by: str | None = None
-    """How rows form sessions ("session_id", "gap" or "user"); `PrepareOptions.session_by` overrides
-    it."""
+    """What forms sessions: "session_id", "gap", "user"; `PrepareOptions.session_by` overrides."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
     time_format: str | None = None
-    """How times are written that are text, as of `strptime`, e.g. "%d/%m/%Y %H:%M"; None for ISO
-    8601."""
+    """The `strptime` format of times that are text, e.g. "%d/%m/%Y %H:%M"; None for ISO 8601."""
     earliest: str | None = None
     """ISO time (UTC) before which times are clock errors; None for 2000."""
     before_ms: int | None = None

@@ -249,7 +249,7 @@ ACTING = [("session", rule) for rule in RULES] + [("horizon", "minimum")]
 
 @pytest.mark.parametrize(("trained", "rule"), ACTING, indirect=["trained"])
 def test_played_scored_ranked_and_recommended_alike(
-    folder: Path, trained: TrainedPolicy, rule: str, tmp_path: Path
+    trained: TrainedPolicy, rule: str, tmp_path: Path
 ) -> None:
     log, given = tagged_log(), RULES[rule]
     sessions = list(last_sessions(log))[:4]

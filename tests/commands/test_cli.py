@@ -349,7 +349,7 @@ def test_ope_agrees_with_rollouts(catalog: Catalog, tmp_path: Path, capsys: Caps
     assert rows["DR"].details["reliable"]
 
 
-def test_model_card(catalog: Catalog, tmp_path: Path, capsys: Capsys) -> None:
+def test_model_card(catalog: Catalog, tmp_path: Path) -> None:
     shutil.copytree(catalog[0], tmp_path / "run")
     run, logs = str(tmp_path / "run"), str(tmp_path / "sessions.parquet")
     log, card = pd.read_parquet(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"

@@ -123,7 +123,7 @@ def test_an_unknown_kind_of_place_is_one_line(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["a\\b.parquet", "..\\b.parquet", "c:b.parquet"])
-def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_name_that_would_lead_out_of_the_folder_is_refused(name: str) -> None:
     system, folder = _open("memory://names-that-lead-out")
     with system.open(f"{folder}/{name}", "wb") as out:
         out.write(b"1")

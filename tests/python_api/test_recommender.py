@@ -206,7 +206,7 @@ def test_rows_are_warned_of_once_at_the_users_line(
         assert len([each for each in noted if issubclass(each.category, InputNote)]) == 1
 
 
-def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.DataFrame) -> None:
+def test_data_that_cannot_be_used(folder: Path, log: pd.DataFrame) -> None:
     policy = Recommender("dt", settings=SMALL)
     store = folder / "store"
     for data, options, message in (

@@ -222,7 +222,7 @@ def test_unknown_items_are_refused_or_skipped(policy: Recommender, log: pd.DataF
     assert len(policy.recommend(newcomer, k=4, skip_unknown=True)) == 4
 
 
-def test_the_reward_is_the_runs_expression_or_a_column(log: pd.DataFrame, tmp_path: Path) -> None:
+def test_the_reward_is_the_runs_expression_or_a_column(log: pd.DataFrame) -> None:
     feedback = log.rename(columns={"reward": "is_click"}).assign(seconds=range(len(log)))
     policy = Recommender("dt", settings=FAST).fit(feedback, reward="1 - 2 * is_click")
     evaluated = policy.recommend(feedback)

@@ -67,7 +67,7 @@ class LoggedScores:
         steps: IntArray,
     ) -> None:
         self.view, self.episodes, self.steps = view, episodes, steps
-        self.items = view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        self.items = view.items_at(episodes, steps)
         """(M,) logged."""
         self.liked = liked_rewards(view, view.step_values(schema.REWARD, episodes, steps))
         """(M,) bool."""

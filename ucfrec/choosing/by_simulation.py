@@ -270,7 +270,7 @@ class RuleSearch:
         """The rules with evidence: of many sessions where it decides, and no lookahead is slow;
         effective users of few sessions count as if there were as many."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
-        fast = [item for item in candidates if item not in slow]
+        fast = [item for item in candidates if self.least_users and not item.rule.looks_ahead]
         results = list[SimulatedRule]()
         for logged, part in ((self._many, fast), (self._few, slow)):
             times = self._many.n_users / max(logged.n_users, 1)
@@ -345,10 +345,7 @@ class RuleSearch:
         allowed = [*filter(self.is_allowed, candidates)]
         return allowed or [*filter(self.is_supported, candidates)]
 
-    def finalists(
-        self,
-        candidates: Sequence[SimulatedRule],
-    ) -> list[SimulatedRule]:
+    def finalists(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The best, the start, and allowed ones of the highest value, in more sessions."""
         allowed = sorted(filter(self.is_allowed, candidates), key=_value, reverse=True)
         ranked = (self.best(candidates), *self._find_start(candidates), *allowed)

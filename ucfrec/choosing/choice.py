@@ -1,4 +1,4 @@
-"""The choice of a decision rule: its settings, what it is chosen by, and what was chosen."""
+"""The choice of a decision rule: its settings, the criterion and the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -72,7 +72,7 @@ class Table:
     title: ClassVar[str | None] = None
     """Title of the group of the options and, after a semicolon, more of its description."""
     described_by: ClassVar[str] = ""
-    """`MODULE:TABLE`, or `MODULE:CLASS.METHOD`, that fields without a docstring are of."""
+    """`MODULE:TABLE`, or `MODULE:CLASS.METHOD`, that fields without a docstring come from."""
     prefix: ClassVar[str] = ""
     """What the names of these fields begin with, before those that they have there."""
     shows_defaults: ClassVar[bool] = True

@@ -83,7 +83,7 @@ class Verify(Table):
 
 
 def _verify(path: Path) -> int:
-    """Print what `path` is and its faults; returns their number."""
+    """Print the kind of `path` and its faults; returns the number of faults."""
     from ucfrec.episodes.record import StoreRecord
     from ucfrec.results.rows import read_rows
     from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord

@@ -485,5 +485,5 @@ class ActionGenerator:
 def read_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
     """The logged actions of M steps, (M,) int64 items or (M, A) float32 vectors."""
     if view.has_items:
-        return view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        return view.items_at(episodes, steps)
     return view.step_values(schema.ACTION, episodes, steps)

@@ -118,7 +118,7 @@ class CausalRewardModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the model is, and what it is given has to be."""
+        """The device of the model, where its inputs have to be."""
         return self.state_mean.device
 
     def encode(self, inputs: Tensor, residual: Tensor) -> Posterior:

@@ -34,8 +34,7 @@ class ReturnToGo:
         return self.definition == "session"
 
     def weights(self, ahead: IntArray) -> Float64Array:
-        """How much of a reward counts that comes this number of steps later, of the shape of
-        `ahead`."""
+        """Weights, of the shape of `ahead`, of rewards that come so many steps later."""
         reach = self.horizon if self.definition == "horizon" else np.inf
         return np.asarray(ahead < reach, dtype=np.float64)
 

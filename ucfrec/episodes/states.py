@@ -179,7 +179,7 @@ def least_liked(low: _Reward, high: _Reward) -> _Reward:
 def liked_rewards(store: "EpisodeStore", rewards: Array) -> BoolArray:
     """Whether steps (N,) of a store of items were liked: their reward is at least `least_liked`."""
     states = store.item_states
-    return np.asarray(rewards >= least_liked(states.reward_low, states.reward_high))
+    return rewards >= least_liked(states.reward_low, states.reward_high)
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class TrainingCounts:
             names.append(schema.TIMESTAMP)
             last = int(train.column(schema.TIMESTAMP).max())
         for items, rewards, *times in train.column_batches(*names):
-            ages = last - times[0].astype(np.int64) if timed else np.zeros(len(items))
+            ages = last - times[0] if timed else np.zeros(len(items))
             weights = np.exp2(-ages / (half_life * _HOUR_MS))
             shown += np.bincount(items, weights, n_items)
             liked += np.bincount(items, weights * liked_of(train, rewards), n_items)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import LONG, Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -176,17 +176,20 @@ class EpisodeStore(EpisodeView):
                 table += f"<tr><td>{'</td><td>'.join(cells)}</td></tr>"
         return f"<p>{escape(repr(self))}</p><table>{table}</table>"
 
-    def select(self, episodes: IntArray) -> "EpisodeStore":
-        """A view of the episodes at the given positions of this view, in the given order."""
+    def select(self, episodes: IntArray | BoolArray) -> "EpisodeStore":
+        """A view of the episodes at these positions of this view, in their order, or of a mask."""
         return EpisodeStore(self._columns, self.episode_ids[episodes])
+
+    def divide(self, chosen: BoolArray) -> "tuple[EpisodeStore, EpisodeStore]":
+        """Views of the episodes where a mask (E,) is false, and of those where it is true."""
+        return self.select(~chosen), self.select(chosen)
 
     def split(self, name: str) -> "EpisodeStore":
         """A view of the episodes in one split, which may be empty. InputError if `name` is not
         "train", "validation" or "test"."""
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
-        in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
-        return self.select(np.flatnonzero(in_split))
+        return self.select(self.episode_values(schema.SPLIT) == schema.SPLITS.index(name))
 
     def without_long_sessions(self) -> "EpisodeStore":
         """The view without sessions of more than `LONG` times the median number of steps.
@@ -197,7 +200,7 @@ class EpisodeStore(EpisodeView):
         if not len(self):
             return self
         usual = self.lengths <= LONG * np.median(self.lengths)
-        return self if usual.all() else self.select(np.flatnonzero(usual))
+        return self if usual.all() else self.select(usual)
 
     @cached_property
     def whole(self) -> "EpisodeStore":
@@ -253,8 +256,7 @@ class UserRows:
     """The later log, with N steps."""
     earlier: EpisodeStore | None
     source: IntArray
-    """(R,) index of each row among the steps of `later`, or −1 less its index among those of
-    `earlier`."""
+    """(R,) index of each row in the steps of `later`, or −1 less its index in `earlier`."""
     first: IntArray
     """(N,) first row of the user of each later step."""
     place: IntArray
@@ -281,8 +283,8 @@ class UserRows:
         if earlier is not None and later.has_users and earlier.has_users:
             begins = np.full(len(users), np.iinfo(np.int64).max)
             np.minimum.at(begins, owner, times)
-            users_later = later.episode_values(schema.USER).astype(np.int64)
-            users_earlier = earlier.episode_values(schema.USER).astype(np.int64)
+            users_later = later.episode_values(schema.USER)
+            users_earlier = earlier.episode_values(schema.USER)
             # Owner of each user, and −1 for the user −1, the last.
             owner_of = np.full(
                 max(users_later.max(initial=0), users_earlier.max(initial=0)) + 2, -1
@@ -314,7 +316,6 @@ class UserRows:
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
         if earlier is not None and (source < 0).any():
             values[source < 0] = -1 if name in (schema.SESSION_BEGAN, schema.CANDIDATES) else 0
-            # Sets of candidates are numbered by each store.
             if name in earlier.record.columns and name != schema.CANDIDATES:
                 steps = earlier.locate(-1 - source[source < 0])
                 values[source < 0] = earlier.step_values(name, *steps)
@@ -380,12 +381,12 @@ class UserRows:
     def _begins(self, begin: IntArray, gap_ms: float | None) -> IntArray:
         """(E,) row at which the session of each later episode begins, whose first row is `begin`:
         an earlier row, or the same."""
-        times = self.values(schema.TIMESTAMP, self.source).astype(np.int64)
+        times = self.values(schema.TIMESTAMP, self.source)
         pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
         breaks = np.append(True, pause | (self.source[:-1] >= 0))
         breaks[self.first] = True
         starts = np.flatnonzero(breaks)
-        begins = np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
+        begins = starts[np.searchsorted(starts, begin, side="right") - 1]
         if gap_ms is None or schema.SESSION_BEGAN not in self.later.record.columns:
             return begins
         # Rows from the time on that the log names, of users by their first rows.
@@ -403,7 +404,7 @@ class UserRows:
 def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray:
     if schema.TIMESTAMP not in store.record.columns:
         return np.arange(len(steps))
-    return store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+    return store.step_values(schema.TIMESTAMP, episodes, steps)
 
 
 class _JoinedRows:

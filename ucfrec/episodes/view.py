@@ -84,8 +84,7 @@ class Columns:
         self.return_to_go = ReturnToGo()
         """What the returns-to-go count."""
         self.skipped: IntArray | None = None
-        """(E,) number of steps at the beginning of each episode that are known but do not count;
-        None for none."""
+        """(E,) first steps of each episode that are known but do not count; None for none."""
 
     def replace(
         self,
@@ -206,7 +205,7 @@ class Columns:
         numbers (B,) in the store; of steps below 0, they are undefined.
         """
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
-        observations = torch.zeros(*steps.shape, 0)
+        observations = torch.zeros((*steps.shape, 0))
         if self.observation_size:
             observations = torch.from_numpy(self.step_column(schema.OBSERVATION).take(index))
         if not self.has_items:
@@ -299,8 +298,7 @@ class EpisodeView:
 
     @cached_property
     def item_states(self) -> ItemStates:
-        """Builds states from items; for stores of items only. InputError if the file of item states
-        is missing or damaged."""
+        """Builds states from items, in a store of items. InputError if their file is damaged."""
         return self._columns.item_states
 
     @property
@@ -309,8 +307,7 @@ class EpisodeView:
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
     def episode_values(self, name: str) -> Array:
-        """An episode column, (E,). InputError if the store has no such column, or its files are
-        damaged."""
+        """An episode column, (E,). InputError if the store lacks it or its files are damaged."""
         return self._columns.episode_column(name)[self.episode_ids]
 
     @property
@@ -338,6 +335,10 @@ class EpisodeView:
         index = self._columns.starts[self.episode_ids[episodes]] + steps
         return self._columns.step_column(name).take(index)
 
+    def items_at(self, episodes: IntArray, steps: IntArray) -> IntArray:
+        """The int64 items of steps, as `step_values`; −1 for unknown ones."""
+        return self.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+
     @property
     def has_offers(self) -> bool:
         """Whether items come and go; otherwise all are always on offer."""
@@ -349,7 +350,7 @@ class EpisodeView:
         offers = self._columns.offers
         if offers is None:
             return None
-        times, sets = self.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64), None
+        times, sets = self.step_values(schema.TIMESTAMP, episodes, steps), None
         if schema.CANDIDATES in self.record.columns:
             numbers = self.step_values(schema.CANDIDATES, episodes, steps)
             sets = torch.from_numpy(numbers.astype(np.int64))

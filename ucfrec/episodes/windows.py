@@ -181,8 +181,7 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposed(_Rows):
-    """The items shown before each of M steps with their rewards, the step's return-to-go, and what
-    was on offer."""
+    """Items shown before each of M steps and their rewards; the return-to-go and offer of steps."""
 
     items: Tensor
     """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
@@ -338,7 +337,7 @@ class Sessions(_Rows):
         recent = Shown.before(store, episodes, starts, max(length, context - 1))
         users = np.full(len(steps), -1)
         if store.has_users:
-            users = store.episode_values(schema.USER).astype(np.int64)[episodes]
+            users = store.episode_values(schema.USER)[episodes]
         return cls(
             recent.items.flip(1),
             recent.rewards.flip(1),
@@ -428,7 +427,7 @@ class Sessions(_Rows):
 def seen_before(store: "EpisodeStore", episodes: IntArray, steps: IntArray) -> Tensor:
     """(B, n_items) bool: the known items that sessions (B,) showed before steps (B,)."""
     rows, earlier_steps = list_earlier(steps)
-    items = store.step_values(schema.ITEM, episodes[rows], earlier_steps).astype(np.int64)
+    items = store.items_at(episodes[rows], earlier_steps)
     seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
     seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
     return seen
@@ -463,7 +462,7 @@ class AugmentedEpisodes:
     edit_step: IntArray = field(default_factory=_no_integers)
     """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
     action_source: IntArray = field(default_factory=_no_integers)
-    """(N,) number in the store of the episode that an action copy is of."""
+    """(N,) number in the store of the episode that an action copy was made from."""
     action_step: IntArray = field(default_factory=_no_integers)
     """(N,) step of the episode with the other action, the last of the copy."""
     action: Array = field(default_factory=_no_integers)

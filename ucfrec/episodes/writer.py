@@ -242,7 +242,7 @@ def read_observations(store: "EpisodeStore") -> Float32Array:
     """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
     if not store.observation_size:
         return np.zeros((store.n_steps, 0), dtype=np.float32)
-    return np.asarray(store.column(schema.OBSERVATION))
+    return store.column(schema.OBSERVATION)
 
 
 def require_steps(path: Path | str, lengths: Array) -> IntArray:

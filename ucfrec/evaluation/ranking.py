@@ -111,7 +111,7 @@ class Later:
 
     @cached_property
     def _users(self) -> IntArray:
-        return self.store.episode_values(schema.USER).astype(np.int64)
+        return self.store.episode_values(schema.USER)
 
 
 @dataclass(frozen=True)

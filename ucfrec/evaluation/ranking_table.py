@@ -101,7 +101,7 @@ def factor_rankers(
     from implicit.bpr import BayesianPersonalizedRanking
     from threadpoolctl import threadpool_limits
 
-    owners = train.episode_values(schema.USER).astype(np.int64)
+    owners = train.episode_values(schema.USER)
     users = owners[train.all_steps()[0]]
     items = train.column(schema.ITEM)
     liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)

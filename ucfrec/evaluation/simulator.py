@@ -67,7 +67,7 @@ def environment_items(env: "VectorEnv[Any, Any, Any]") -> IntArray:
 
 @dataclass(frozen=True)
 class Environment:
-    """A simulator and what it is made from."""
+    """A simulator and its source."""
 
     name: str
     """Name of a simulator plugin, or `gymnasium:` and the identifier of an environment."""

@@ -36,7 +36,7 @@ _LARGEST_TOML = 2**24
 _held: set[tuple[int, Path]] = set()
 """(process, path) of the claims that are held; a fork holds none of its parent's."""
 _locks: set[BaseFileLock] = set()
-"""Of this process, held or asked for; what an interruption leaves of them is released."""
+"""Locks that this process holds or waits for; what an interruption leaves is released."""
 
 
 @contextmanager

@@ -131,7 +131,7 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     # Messages have to be of one size, that of the largest.
     joined = []
     for part in (rows, values):
-        padded = part.new_zeros(max(counts), *part.shape[1:])
+        padded = part.new_zeros((max(counts), *part.shape[1:]))
         padded[: len(part)] = part
         parts = [torch.empty_like(padded) for _ in range(processes())]
         distributed.all_gather(parts, padded)

@@ -52,8 +52,7 @@ class AppendOptions:
     """How `append_logs` adds logs."""
 
     window_ms: int | None = None
-    """Sessions that ended longer ago than this, before the end of the new logs, are left out; None
-    keeps all."""
+    """Leave out sessions that ended longer than this before the new logs end; None keeps all."""
     split: tuple[float, ...] = SPLIT
     """As of `PrepareOptions`, of the new rows."""
     memory_limit: str = "2GB"
@@ -272,8 +271,7 @@ def _survey_ids(
 
 
 class _Shard:
-    """A shard of the old store: `lengths` (E,) of its episodes, which of them `stays` (E,), and the
-    `times` of its steps (S,)."""
+    """A shard of the old store: `lengths` of episodes, whether each `stays` (E,); `times` (S,)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.offsets = folder, np.load(folder / f"{schema.OFFSETS}.npy")
@@ -282,8 +280,7 @@ class _Shard:
         self.stays: BoolArray = np.ones(len(self.lengths), dtype=bool)
 
     def load(self, name: str, rows: BoolArray) -> Array:
-        """A column at the steps of some episodes (E,) or at some steps (S,), even if it is one of
-        episodes."""
+        """A column of steps or episodes, at the steps of episodes (E,) or at steps (S,)."""
         values = np.load(self.folder / f"{name}.npy", mmap_mode="r")
         if len(rows) == len(self.lengths):
             rows = np.repeat(rows, self.lengths)

@@ -14,7 +14,7 @@ from ucfrec.files.parquet import require_table_names, table_writer
 from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
-from ucfrec.logs.rows import DECISION_MS
+from ucfrec.logs.rows import DAY_MS, DECISION_MS
 from ucfrec.logs.summary import MANY, note_undefined
 from ucfrec.logs.tables import (
     EXPOSED,
@@ -60,7 +60,6 @@ _SAME_KEY = (
 )
 """Whether feedback `f` and exposure `e` are of the same user and item."""
 _WRITE_NUMBERS = "write numbers as 12.50, truth values as true and false"
-_DAY_MS = 86_400_000
 
 
 @dataclass(frozen=True)
@@ -271,8 +270,7 @@ def _make_feedback(
 def _feedback_columns(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
 ) -> tuple[str, ...]:
-    """Columns of numbers and truth values but `keys` (in lower case), each once, with a note on
-    those that are left out."""
+    """Numeric and boolean columns but `keys` (in lower case), with a note on those left out."""
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
     not_numbers = []
@@ -375,7 +373,7 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
     ((requests, equal, request, given_at, midnight, users, other_request, shown_at),) = (
         connection.sql(
             f"SELECT count({_REQUEST}), count_if({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)),"
-            f" min({_REQUEST}), {span}, coalesce(bool_and(timestamp % {_DAY_MS} = 0), false), "
+            f" min({_REQUEST}), {span}, coalesce(bool_and(timestamp % {DAY_MS} = 0), false), "
             f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
             f"(SELECT min({_REQUEST}) FROM exposures), (SELECT {span} FROM exposures) FROM feedback"
         ).fetchall()

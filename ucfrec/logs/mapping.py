@@ -88,13 +88,11 @@ class LogMapping:
     reward: str | None = None
     """SQL expression of the reward; `PrepareOptions.reward` overrides it."""
     session_by: str | None = None
-    """How rows form sessions ("session_id", "gap" or "user"); `PrepareOptions.session_by` overrides
-    it."""
+    """What forms sessions: "session_id", "gap", "user"; `PrepareOptions.session_by` overrides."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
     time_format: str | None = None
-    """How times are written that are text, as of `strptime`, e.g. "%d/%m/%Y %H:%M"; None for ISO
-    8601."""
+    """The `strptime` format of times that are text, e.g. "%d/%m/%Y %H:%M"; None for ISO 8601."""
     earliest: str | None = None
     """ISO time (UTC) before which times are clock errors; None for 2000."""
     before_ms: int | None = None
@@ -292,9 +290,8 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs (or a single one), each once.
 
     A folder stands for all log files in it and its sub-folders, by name, but for stores, runs, and
-    those whose names begin with a dot or an underscore. Sets of candidates are no logs, and left
-    out beside some. Raises InputError if a path is missing,
-    matches no log file, or is a file of another kind.
+    those whose names begin with a dot or an underscore. Beside logs, sets of candidates are not
+    listed. InputError if a path is missing, matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
     # A text is a sequence of texts, too: its characters.

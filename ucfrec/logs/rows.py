@@ -90,8 +90,7 @@ class RowVectors:
         """(M, O) observations of the rows at the positions (M,), from 1."""
         if self._file is None:
             return np.frombuffer(self._memory, np.float32).reshape(self._shape)[rows - 1]
-        # Mapped anew each time: mapped pages count as the memory of a process that must keep to a
-        # limit.
+        # Mapped anew each time: mapped pages count as memory of the process.
         mapped: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
             self._file, np.float32, "r", shape=self._shape
         )
@@ -141,7 +140,7 @@ class SortedRows:
     dropped: dict[str, int]
     """Number of dropped rows by reason."""
     read: int
-    """Number of rows; those below are of usable ones: no duplicates, with a finite reward."""
+    """Number of rows. Those below count usable rows: no duplicates, with a finite reward."""
     count: int = 0
     conflicts: int = 0
     """Number of duplicates with another reward than the row that counts."""
@@ -184,7 +183,7 @@ class SortedRows:
         self.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
         usable = ~(repeated | undefined)
         if not usable.all():
-            batch = {name: values[usable] for name, values in batch.items()}
+            batch = take_rows(batch, usable)
         if not usable.any():
             return
         times, rewards, rows = (batch[n] for n in (schema.TIMESTAMP, schema.REWARD, "row"))
@@ -206,7 +205,7 @@ class SortedRows:
         list_keys = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
         if list_keys:
             order = np.lexsort([*list_keys, times, batch[USER]])
-            batch = {name: values[order] for name, values in batch.items()}
+            batch = take_rows(batch, order)
             times = batch[schema.TIMESTAMP]
         if by_session:
             users, sessions = batch[USER], batch[SESSION]
@@ -214,7 +213,7 @@ class SortedRows:
             keys_of_sessions = (users.astype(np.int64) << 32) + sessions
             _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
             order = np.lexsort((sessions, times[first][place], users))
-            batch = {name: values[order] for name, values in batch.items()}
+            batch = take_rows(batch, order)
         batch, repeated_positions = _place_in_lists(batch, by_session)
         self.repeated_positions += repeated_positions
         self.has_lists |= bool(batch[schema.PLACE].any())
@@ -228,14 +227,14 @@ class SortedRows:
     ) -> dict[str, Array]:
         """The rows with the one that counts as the first of those that repeat the one before."""
         places = np.flatnonzero(repeated | np.append(repeated[1:], False))
-        some = {name: values[places] for name, values in batch.items()}
+        some = take_rows(batch, places)
         if self.observations is not None:
             some[schema.OBSERVATION] = self.observations.read(some["row"])
         groups = np.cumsum(~repeated)[places]
         order = places[np.lexsort([*order_duplicates(some, duplicates), groups])]
         source = np.arange(len(repeated))
         source[places] = order
-        return {name: values[source] for name, values in batch.items()}
+        return take_rows(batch, source)
 
 
 def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
@@ -259,7 +258,7 @@ def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str
         if repeated := int((~first).sum()):
             occurrences = _count_since(first)[order.argsort()]
             order = np.lexsort((occurrences, times, decisions))
-            batch = {name: values[order] for name, values in batch.items()}
+            batch = take_rows(batch, order)
             lists = np.maximum.accumulate((decisions * len(times) + occurrences)[order])
             begins = np.append(True, ~_equal_before(lists))
     return {**batch, schema.PLACE: _count_since(begins).astype("<i4")}, repeated
@@ -269,6 +268,11 @@ def _count_since(begins: BoolArray) -> IntArray:
     """(M,) number of rows since the last one that begins something, as the first does."""
     rows = np.arange(len(begins))
     return rows - np.maximum.accumulate(np.where(begins, rows, 0))
+
+
+def take_rows(batch: Mapping[str, Array], rows: IntArray | BoolArray | slice) -> dict[str, Array]:
+    """Some rows of columns, by their numbers, a mask or a slice."""
+    return {name: values[rows] for name, values in batch.items()}
 
 
 def _equal_before(values: Array) -> BoolArray:
@@ -285,7 +289,7 @@ def keep_users_whole(batches: Iterable[dict[str, Array]], user: str) -> Iterator
             ends = np.flatnonzero(~_equal_before(pending[user]))
             end = int(ends[-1]) + 1 if len(ends) else 0
             if end:
-                yield {name: values[:end] for name, values in pending.items()}
+                yield take_rows(pending, slice(end))
             batch = {name: np.concatenate([pending[name][end:], batch[name]]) for name in batch}
         pending = batch
     if pending and len(pending[user]):
@@ -473,7 +477,7 @@ def choose_rows(
     order = np.lexsort((times, users))
     apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
     if apart.all():
-        return np.asarray(order[finite[order]])
+        return order[finite[order]]
     tied = np.zeros(len(users), dtype=bool)
     tied[order[1:]] |= ~apart
     tied[order[:-1]] |= ~apart
@@ -489,7 +493,7 @@ def choose_rows(
     order = order[first & finite[order]]
     if schema.POSITION in rows:  # a list, in its order
         order = order[np.lexsort([rows[schema.POSITION][order], times[order], users[order]])]
-    return np.asarray(order)
+    return order
 
 
 def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:

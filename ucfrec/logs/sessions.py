@@ -20,7 +20,15 @@ from ucfrec.episodes.item_table import OFFERS
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
-from ucfrec.logs.rows import CANDIDATE_SET, CODES, ITEM, SESSION, USER, SortedRows
+from ucfrec.logs.rows import (
+    CANDIDATE_SET,
+    CODES,
+    ITEM,
+    SESSION,
+    USER,
+    SortedRows,
+    take_rows,
+)
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import Progress
@@ -147,8 +155,7 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         too_long = lengths > (lengths.max() if cut.max_steps is None else cut.max_steps)
         fits = (lengths >= cut.min_steps) & ~too_long
         if not fits.all():
-            steps = np.repeat(fits, lengths)
-            batch = {name: values[steps] for name, values in batch.items()}
+            batch = take_rows(batch, np.repeat(fits, lengths))
         yield Episodes(
             batch,
             lengths[fits],
@@ -378,8 +385,7 @@ def list_text_ids(store: Path | None) -> tuple[str, ...]:
 
 
 def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str, list[Any]]:
-    """Write `users.parquet`, `items.parquet` and when items are on offer; returns a digest of each
-    for the fingerprint."""
+    """Write the files of users, items and offers; returns digests for the fingerprint."""
     digests: dict[str, list[Any]] = {}
     for name, table, file in ID_TABLES:
         if name not in log.columns:

@@ -22,7 +22,7 @@ from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
 MANY = 0.2
-"""Share of the rows from which on what happens to them is worth a warning."""
+"""Share of the rows from which on a fault of theirs is worth a warning."""
 FEW_IDS = 20
 MOST_UNKNOWN = 0.9
 """Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
@@ -233,8 +233,7 @@ def note_unknown(
 
 
 def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None:
-    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions
-    (`where`)."""
+    """Warn of a reason that drops over a fifth of the rows, and of undefined `where`."""
     log = rows.log
     if where is not None and rows.dropped["left_out"]:
         note_undefined(log.connection, log.tables, where)

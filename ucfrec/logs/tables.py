@@ -101,7 +101,7 @@ class Table:
         return self.of(selected, [*self.raw, *texts])
 
     def text_of(self, name: str) -> str:
-        """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
+        """SQL of the text of a column; of a CSV file as written: 007 is not 7."""
         return f"CAST({quote_name(name if self.columnar else raw_name(name))} AS VARCHAR)"
 
     @property

@@ -423,13 +423,13 @@ class BoostedPolicy(ScoringPolicy):
         """Inputs (M, F) of the trees at training steps (M,), from other folds of the episodes, and
         which were liked; sets the effects of pairs of attributes to those of all folds."""
         folds = np.arange(train.n_episodes) % _FOLDS
-        parts = (train.select(np.flatnonzero(folds == fold)) for fold in range(_FOLDS))
+        parts = (train.select(folds == fold) for fold in range(_FOLDS))
         of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
         whole = torch.stack([self.impressions, self.liked]).cpu()
         # (2, folds, n_items) of the others.
         inputs, liked = self._rows(train, numbers, whole.unsqueeze(1) - torch.stack(of_folds, 1))
         episodes, steps = train.locate(numbers)
-        items = train.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        items = train.items_at(episodes, steps)
         tags = train.item_states.tags.numpy().reshape(len(self.tag), -1)
         inputs[:, _PAIRS] = 1  # before the context
         context = inputs[:, _PAIRS : _PAIRS + self.effects.shape[1]].astype(np.float64)

@@ -133,17 +133,5 @@ def _outputs(policy: SequencePolicy, windows: Windows) -> tuple[Tensor, Tensor]:
 
 
 def _alike(first: Tensor, second: Tensor, tolerance: float = _TOLERANCE) -> bool:
-    scale = (
-        float(
-            first.nan_to_num(
-                0,
-                0,
-                0,
-            )
-            .abs()
-            .max()
-        )
-        if first.numel()
-        else 0.0
-    )
+    scale = float(first.nan_to_num(0, 0, 0).abs().max())
     return torch.allclose(first, second, rtol=0, atol=tolerance * scale, equal_nan=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -73,14 +74,11 @@ class CRMGreedyPolicy(SequencePolicy):
         if not isinstance(model, ItemRewardModel):
             return None
         if validation is None:
-            tenth = np.arange(train.n_episodes) % 10 == 1
-            validation = train.select(np.flatnonzero(tenth))
-            train = train.select(np.flatnonzero(~tenth))
-
-        held_out = validation
+            train, validation = train.divide(np.arange(train.n_episodes) % 10 == 1)
+        fit = partial(fit_item_reward_model, train, validation, folder, seed)
 
         def solve() -> None:
-            fitted, _ = fit_item_reward_model(train, held_out, folder, seed)
+            fitted, _ = fit()
             model.load_state_dict(fitted.state_dict())
 
         return solve

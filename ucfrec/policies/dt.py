@@ -115,11 +115,8 @@ class Block(nn.Module):
         else:
             layer, dim = self.query_key_value, hidden.shape[-1]
             query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
-            key, value = F.linear(
-                normed,
-                layer.weight[dim:],
-                layer.bias[dim:],
-            ).chunk(2, dim=-1)
+            key_value = F.linear(normed, layer.weight[dim:], layer.bias[dim:])
+            key, value = key_value.chunk(2, dim=-1)
             hidden, visible = hidden[:, rows], visible[:, :, rows]
         rate = self.rate if self.training else 0.0
         mixed = attend(query, key, value, visible, self.heads, rate)
@@ -150,24 +147,16 @@ def attend(
 ) -> Tensor:
     """Scaled dot-product attention (B, M, d) of queries (B, M, d) to keys and values (B, L, d) that
     are `visible` (B, 1, M, L), some in each row; drops weights as `Dropout`."""
-    batch, rows, dim = query.shape
+    size = query.shape[0], -1, heads, query.shape[2] // heads
     # (B, L, d) -> (B, H, L, d/H)
-    query, key, value = (
-        x.view(
-            batch,
-            -1,
-            heads,
-            dim // heads,
-        ).transpose(1, 2)
-        for x in (query, key, value)
-    )
+    query, key, value = (x.view(size).transpose(1, 2) for x in (query, key, value))
     if dropout == 0 or query.device.type != "cpu":
         mixed = F.scaled_dot_product_attention(query, key, value, visible, dropout)
     else:
         scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
         weights = scores.masked_fill(~visible, -torch.inf).softmax(-1)
         mixed = torch.matmul(weights * draw_mask(weights.shape, dropout), value)
-    return mixed.transpose(1, 2).reshape(batch, rows, dim)
+    return mixed.transpose(1, 2).flatten(2)
 
 
 @settings_table("policy")

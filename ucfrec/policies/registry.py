@@ -7,12 +7,11 @@ a class derived from `ucfrec.policies.base.SequencePolicy`::
     mine = "my_package.policy:MyPolicy"
 """
 
-import warnings
 from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.plugins import load_plugin, plugin_names, plugin_package
 
 if TYPE_CHECKING:
@@ -86,9 +85,7 @@ def policy_package(name: str) -> str:
 def note_ignored(name: str) -> None:
     """Warn, once, if a plugin has the name of the built-in policy `name`."""
     if name in BUILT_IN and name in plugin_names("policies"):
-        warnings.warn(
+        warn_user(
             f"the policy {name!r} of package {plugin_package('policies', name)} is ignored, because"
-            " a built-in policy has its name; give it another name",
-            InputNote,
-            stacklevel=2,
+            " a built-in policy has its name; give it another name"
         )

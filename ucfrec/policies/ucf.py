@@ -296,11 +296,7 @@ class CausalDepthwise(nn.Conv1d):
         return convolve_depthwise(steps, taps[:, None], self.bias[None])  # type: ignore[index]
 
 
-def convolve_depthwise(
-    steps: Tensor,
-    taps: Tensor,
-    bias: Tensor,
-) -> Tensor:
+def convolve_depthwise(steps: Tensor, taps: Tensor, bias: Tensor) -> Tensor:
     """A causal depthwise convolution, Σ_n x_{t − n} ⊙ w_{n, t} + b_t, as (B, K, d).
 
     Args:
@@ -338,10 +334,7 @@ class _ShiftedProducts(torch.autograd.Function):
         return of_steps, of_taps, gradient.sum(over).view(-1, gradient.shape[2])
 
 
-def _taps_of_later(
-    taps: Tensor,
-    back: int,
-) -> Tensor:
+def _taps_of_later(taps: Tensor, back: int) -> Tensor:
     """The taps (1, d) of all steps, or of those of (K, d) that have a step `back` before them."""
     return taps if len(taps) == 1 else taps[back:]
 
@@ -396,27 +389,12 @@ def parent_targets(
     a_{t−1} with weight `previous_action` (Table 7). Padded parents, where the mask (B, K) is false,
     are dropped, and the rest sums to one; rows of padded steps are zero.
     """
-    batch, length = mask.shape
-    back = torch.arange(length).unsqueeze(1) - torch.arange(length)  # (K, K) t − j
-    weights = torch.zeros(length, length, 3)
-    weights[..., 0] = (back == 0).float()
-    weights[..., 1] = torch.where(
-        (back >= 0) & (back <= window),
-        decay ** back.clamp(min=0),
-        0.0,
-    )
-    weights[..., 2] = previous_action * (back == 1).float()
-    weights = (
-        weights.to(mask.device)
-        * mask.view(
-            batch,
-            1,
-            length,
-            1,
-        )
-        * mask.view(batch, length, 1, 1)
-    )
-    targets = weights.reshape(batch, length, 3 * length)
+    steps = torch.arange(mask.shape[1], device=mask.device)
+    back = steps.unsqueeze(1) - steps  # (K, K) t − j
+    of_states = decay ** back.clamp(min=0) * ((back >= 0) & (back <= window))
+    weights = torch.stack([(back == 0).float(), of_states, previous_action * (back == 1)], -1)
+    valid = mask.unsqueeze(1) & mask.unsqueeze(2)
+    targets = (weights * valid.unsqueeze(3)).flatten(2)
     return targets / targets.sum(-1, keepdim=True).clamp(min=EPSILON)
 
 

@@ -16,7 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import Histories, frame_histories, read_histories
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
-from ucfrec.logs.rows import choose_rows
+from ucfrec.logs.rows import choose_rows, take_rows
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -126,7 +126,7 @@ def _read_plain(frame: pd.DataFrame, by_id: bool, duplicates: str) -> Histories 
         return None
     table |= {schema.REWARD: rewards, "row": np.arange(len(frame))}
     order = choose_rows(table, duplicates)
-    table = {name: values[order] for name, values in table.items()}
+    table = take_rows(table, order)
     users, owner, counts = np.unique(table["user"], return_inverse=True, return_counts=True)
     recent = np.cumsum(counts)[owner] - np.arange(len(owner)) <= LONGEST_HISTORY
     items, codes = np.unique(table[schema.ITEM], return_inverse=True)

@@ -312,8 +312,8 @@ def _pad_lists(lists: Sequence[IntArray], width: int) -> Tensor:
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
-    """Numbers (N,) of items that are named; InputError if the policy does not know
-    some of them, or any with `skip_unknown`, which leaves those out."""
+    """Numbers (N,) of named items. InputError if the policy does not know one of them; with
+    `skip_unknown`, which leaves unknown ones out, only if it knows none."""
     numbers = index.numbers(ids)
     in_catalogue = numbers >= 0
     if not (in_catalogue.any() if skip_unknown else in_catalogue.all()):

@@ -82,7 +82,7 @@ class Mean(NamedTuple):
 
     @property
     def value(self) -> float:
-        """The mean; 0 if it is of nothing."""
+        """The mean; 0 if nothing was counted."""
         return self.total / self.weight if self.weight else 0.0
 
 

@@ -236,7 +236,7 @@ class _Worker:
     failure: str = ""
 
     def receive(self) -> str:
-        """Receive a report, or the end of the process: what it is."""
+        """Receive a report, or the end of the process; returns its kind."""
         try:
             news, text = self.connection.recv()
         except (EOFError, OSError):

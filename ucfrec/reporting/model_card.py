@@ -94,7 +94,7 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
 
 
 def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
-    """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
+    """Add the estimate behind the verdict of `ucfrec ope` to the card of the run."""
     rows = {row.method: row for row in report.rows}
     verdict = report.verdict
     row = rows.get(verdict.estimator or LOGGED, rows[LOGGED])

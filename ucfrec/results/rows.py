@@ -48,7 +48,7 @@ Scalar = str | bool | int | float | None
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
-    """Identifies a measurement; rows with equal keys are of the same one."""
+    """Identifies a measurement: rows with equal keys belong to the same one."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -75,7 +75,7 @@ class RowKey:
     """Fingerprint of the store."""
 
     def covers(self, row: "ResultRow") -> bool:
-        """Whether `row` is of this measurement; `row` may have more conditions."""
+        """Whether `row` belongs to this measurement; `row` may have more conditions."""
         return (
             all(getattr(row, name) == getattr(self, name) for name in _KEY_FIELDS)
             and self.conditions.items() <= row.conditions.items()

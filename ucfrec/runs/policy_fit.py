@@ -63,7 +63,7 @@ def fit_policy(
         for number in range(_VALIDATION_BATCHES):
             episodes, steps = validation.draw_steps(generator, _VALIDATION_BATCH)
             if learnable is not None:
-                items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+                items = validation.items_at(episodes, steps)
                 if (inside := learnable[items]).any():
                     episodes, steps = episodes[inside], steps[inside]
             if alone or number % distributed.processes() == distributed.rank():

@@ -63,8 +63,7 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
         )
     if validation.n_episodes:
         return train, validation
-    held_out = np.arange(train.n_episodes) % 10 == 1
-    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
+    return train.divide(np.arange(train.n_episodes) % 10 == 1)
 
 
 def continue_users(later: EpisodeStore, train: EpisodeStore) -> EpisodeStore:
@@ -218,7 +217,7 @@ def _sample_offers(view: EpisodeStore) -> Iterator[tuple[Offer | None, Tensor]]:
     numbers = np.arange(0, view.n_steps, -(-view.n_steps * n_items // _OFFERED) or 1)
     for part in np.array_split(numbers, -(-len(numbers) * n_items // _AT_ONCE) or 1):
         episodes, steps = view.locate(part)
-        items = view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        items = view.items_at(episodes, steps)
         yield view.offer(episodes, steps), torch.from_numpy(items)
 
 

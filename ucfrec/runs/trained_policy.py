@@ -130,7 +130,7 @@ class TrainedPolicy:
         return trained
 
     def _require_equal_sizes(self) -> None:
-        """Check that the files of the run are of one catalogue and of one size of states."""
+        """Check that the files of the run agree in their catalogue and in the size of states."""
         record, states = self.record, self.item_states
         sizes, dropped = record.sizes, record.dropped_observations
         most = record.observation_size + len(dropped)

@@ -113,7 +113,7 @@ def update_run(
         changes = measure_drift(trained, training, added, counts, seed)
         split = opened.episode_values(schema.SPLIT)
         newest = opened.split("test")
-        earlier = opened.select(np.flatnonzero(split != schema.SPLITS.index("test")))
+        earlier = opened.select(split != schema.SPLITS.index("test"))
         users = newest.episode_values(schema.USER)
         rows = UserRows.of(newest, users, earlier)
         new = TrainedPolicy.load(out, split=True)

@@ -49,7 +49,7 @@ def compare_runs(
             their users.
     """
     rows = newest.later
-    user = rows.episode_values(schema.USER).astype(np.int64)[rows.all_steps()[0]]
+    user = rows.episode_values(schema.USER)[rows.all_steps()[0]]
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, newest)

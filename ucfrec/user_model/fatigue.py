@@ -110,7 +110,7 @@ class LoggedRuns:
         episodes, steps = view.all_steps()
         runs = tags.runs(Shown.before(view, episodes, steps, lags))
         rewards = torch.from_numpy(view.step_values(schema.REWARD, episodes, steps))
-        return cls(runs, tags.liked(rewards).numpy(), np.asarray(episodes))
+        return cls(runs, tags.liked(rewards).numpy(), episodes)
 
     def count_likes(self, fatigue: Fatigue) -> tuple[float, float]:
         """Likes of fatigued users, and as many as they gave elsewhere in the same sessions."""

@@ -127,7 +127,7 @@ def sum_before(
     asked_times = times.numpy()
     nothing = sum_rows(torch.full((1, 1), -1), torch.zeros(1, 1))
     sums = nothing.double().repeat(len(users), 1)
-    owners = view.episode_values(schema.USER).astype(np.int64)
+    owners = view.episode_values(schema.USER)
     followed = np.flatnonzero(np.isin(owners, asked_users[asked_users >= 0]))
     view = view.select(followed)
     for episodes, steps in view.step_batches(_AT_ONCE):

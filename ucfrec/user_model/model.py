@@ -187,7 +187,7 @@ class LoggedRewards:
     def _weigh(self, slopes: Float64Array) -> Float64Array:
         """(M, K) shares of the values (K,) under slopes (M,) per unit of reward."""
         exponents = self._log_shares + slopes[:, None] * self.values
-        return np.asarray(torch.from_numpy(exponents).softmax(dim=1))
+        return torch.from_numpy(exponents).softmax(1).numpy()
 
     def draw(self, expected: Float64Array, uniform: Float64Array) -> Float64Array:
         """Rewards (M,) with the means `expected` (M,), from `uniform` (M,) in [0, 1)."""
@@ -228,7 +228,7 @@ class UserSimulator:
         length = max(self._lags, store.item_states.window)
         self._sessions = Sessions.begun(sessions * times, length)
         if store.has_users:
-            users = store.episode_values(schema.USER).astype(np.int64)[self._episodes]
+            users = store.episode_values(schema.USER)[self._episodes]
             self._sessions = replace(self._sessions, users=torch.from_numpy(users))
 
     @property

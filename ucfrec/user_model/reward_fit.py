@@ -313,7 +313,7 @@ def _follow_users(
 
 
 def _are_new(rows: RewardRows, held_out: RewardRows) -> bool:
-    """Whether hardly any held-out row is of a user with training rows, of whom there are some."""
+    """Whether there are users with training rows, but they have hardly any held-out rows."""
     trained = torch.unique(rows.users[rows.users >= 0])
     share = float(torch.isin(held_out.users, trained).float().mean())
     return bool(len(trained)) and share < _LEAST_KNOWN

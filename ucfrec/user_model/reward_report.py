@@ -18,12 +18,11 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.reward import PLACES, ItemRewardModel
 
 _BINS = 10
-_CHUNK = 16_384
-_READ_AT_ONCE = 16_384
+_AT_ONCE = 16_384
 _LARGEST_WEIGHT = 10.0
 """Larger weights are cut off, so that no single row decides."""
 SAVED = ConfigDict(extra="forbid")
-"""Of reports that are saved beside what they are of, and read again."""
+"""Of reports that are saved beside their subject, and read again."""
 Line = tuple[float, float]
 
 
@@ -74,20 +73,20 @@ class RewardRows:
     ) -> "RewardRows":
         """The given steps (M,) of a view, with the latest `lags` items shown before them."""
         states = torch.empty(len(steps), view.state_size)
-        for start in range(0, len(steps), _READ_AT_ONCE):
-            part = slice(start, start + _READ_AT_ONCE)
+        for start in range(0, len(steps), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
         users = np.full(view.n_episodes, -1)
         if view.has_users:
-            users = view.episode_values(schema.USER).astype(np.int64)
+            users = view.episode_values(schema.USER)
         starts = view.decision_starts(episodes, steps)
-        times = np.zeros(0)
+        times = np.zeros(0, dtype=np.int64)
         if schema.TIMESTAMP in view.record.columns:
             times = view.step_values(schema.TIMESTAMP, episodes, starts)
         return cls(
-            torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
+            torch.from_numpy(view.items_at(episodes, steps)),
             torch.from_numpy(users[episodes]),
-            torch.from_numpy(times.astype(np.int64)),
+            torch.from_numpy(times),
             Shown.before(view, episodes, starts, lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
@@ -155,8 +154,7 @@ def read_propensities(
 
 def number_users(view: EpisodeStore) -> IntArray:
     """Users (E,) of the episodes of a view; the episodes, where users are not named."""
-    numbers = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
-    return numbers.astype(np.int64)
+    return view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -183,7 +181,7 @@ class ItemRewardReport:
     item_loss: float
     loss: float
     new_users: bool = False
-    """Whether held-out rows are of users without training rows, and no effects of users kept."""
+    """Whether held-out users have no training rows, and effects of users are not kept."""
 
     @property
     def kept(self) -> Mapping[str, float]:
@@ -204,7 +202,7 @@ def score_rows(model: ItemRewardModel, rows: RewardRows) -> Tensor:
             rows.above[part],
             None if sums is None else sums[part],
         )
-        for part in torch.split(torch.arange(len(rows)), _CHUNK)
+        for part in torch.split(torch.arange(len(rows)), _AT_ONCE)
     ]
     return torch.cat(scores)
 

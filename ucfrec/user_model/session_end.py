@@ -83,7 +83,7 @@ class LoggedEnds:
         # A list is shown whole: sessions end with the last row of a decision.
         last = store.decision_ends(episodes, steps) == steps + 1
         episodes, steps = episodes[last], steps[last]
-        items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        items = store.items_at(episodes, steps)
         starts = store.decision_starts(episodes, steps)
         counts = steps + 1 - starts
         owner = np.repeat(np.arange(len(steps)), counts)
@@ -119,8 +119,7 @@ def whole_sessions(
     cut = ~train.terminated & last_sessions(train)
     if np.isin(validation.episode_values(schema.USER), users[cut]).mean() < 0.5:
         return train, validation
-    held_out = users.astype(np.int64) % 5 == 4
-    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
+    return train.divide(users % 5 == 4)
 
 
 @pydantic.dataclasses.dataclass(frozen=True)

@@ -468,11 +468,7 @@ def test_a_run_of_another_store_is_refused(folder: Path, capsys: Capsys) -> None
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
-    arguments: str,
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: Capsys,
+    arguments: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("log.csv").write_text("user_id,item_id,timestamp,reward\n1,1,1,1\n")

@@ -11,12 +11,7 @@ from tests.support.logged_steps import random_steps
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, conclude, estimate
 from ucfrec.off_policy.logged_steps import ItemGroups
-from ucfrec.off_policy.verdict import (
-    check_catalogue_size,
-    describe_rounding,
-    diagnose,
-    pareto_tail,
-)
+from ucfrec.off_policy.verdict import check_catalogue_size, describe_rounding, diagnose, pareto_tail
 
 ITEMS = 10
 PAYS = np.linspace(0.1, 0.5, ITEMS)

@@ -140,13 +140,15 @@ def test_the_return_is_estimated_with_reasons_against_it(folder: Path) -> None:
     assert "discount is 1" in refused("ope", folder / "run", folder / "store", "--discount", 1)
 
 
-def test_the_unit_of_the_actions_does_not_matter(folder: Path, tmp_path: Path) -> None:
+def test_units_do_not_matter(folder: Path, tmp_path: Path) -> None:
     store = EpisodeStore.open(folder / "store")
     source = {"where": "here", "dataset": "small", "env_id": None, "versions": {}}
     names = (schema.OBSERVATION, schema.ACTION, schema.REWARD)
-    seen, actions, rewards = (store.column(name) for name in names)
+    seen, *others = (store.column(name) / 2**30 for name in names)
     ends = store.lengths, store.terminated.astype(bool), None
-    trajectories = Trajectories(seen, actions / 1000, rewards, *ends, source)
+    with pytest.raises(InputError, match=r"shape \(960, 0\), so no numbers"):
+        Trajectories(seen[:, :0], *others, *ends, source)
+    trajectories = Trajectories(seen, *others, *ends, source)
     small = trajectories.write_store(tmp_path / "store")
     losses = []
     for data in (store, small):

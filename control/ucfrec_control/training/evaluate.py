@@ -54,11 +54,12 @@ def evaluate_run(
     """One result row for each checkpoint and target return; a score where reference returns are
     known, the return otherwise.
 
-    All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
-    checkpoint; they and behaviour cloning take no target return.
+    All rows have the same initial states, after `SIDE_BY_SIDE` episodes if steps draw no random
+    numbers. Distractors are fixed. IQL and CQL keep only their last checkpoint; they and behaviour
+    cloning take no target return.
 
     Args:
-        seed: of the environments and the bootstrap.
+        seed: of the first environment and the bootstrap; the next environment has the next seed.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns; empty for those of the preset, else the run's own.
         checkpoints: of "last", "best" and, where the training selected by return, "return".

@@ -60,8 +60,7 @@ def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> No
 
 
 def test_another_environment_version_warns(folder: Path) -> None:
-    asked = (*LAST, "--target", 100, "--env", "Hopper-v4")
-    said = control("evaluate", folder / "store-run", *asked)[1]
+    said = control("evaluate", folder / "store-run", *LAST, "--target", 9, "--env", "Hopper-v4")[1]
     assert "warning: the data is of Hopper-v5, the evaluation is in Hopper-v4" in said
     assert not mismatches({"env_id": "Tank-v0", "versions": {}}, "mine:Tank-v0")
 
@@ -79,8 +78,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
 def test_data_runs_no_code(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "theirs.py").write_text("raise SystemExit('their code ran')")
     monkeypatch.syspath_prepend(tmp_path)
-    entry = ("data", "env_id")
-    run = changed(folder / "store-run", tmp_path / "run", entry, "theirs:Hopper-v5")
+    run = changed(folder / "store-run", tmp_path / "run", ("data", "env_id"), "theirs:Hopper-v5")
     assert "the Python module theirs would be run" in refused("evaluate", run, "--episodes", 1)
 
 

@@ -176,6 +176,17 @@ def rules_of(
     return [DecisionRule(target) for target in targets] or [trained.rule]
 
 
+def choose_rule(
+    trained: Trained, target: float | None = None, env_id: str | None = None
+) -> DecisionRule | None:
+    """The rule of one target return; with None, the first of `rules_of`. InputError if there is a
+    target return, but the policy takes none."""
+    if target is not None and not takes_target(trained.record):
+        name = trained.record.config.policy_name
+        raise InputError(f"no target return is taken by {name}; leave the target out")
+    return rules_of(trained, env_id, () if target is None else (target,))[0]
+
+
 def play(
     trained: Trained,
     env_id: str,

@@ -71,6 +71,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
     (row,) = evaluate_run(cloned, episodes=1, seed=0, checkpoints=("last",))
     assert (row["target_return"], row["rule"]) == (None, "no target return")
     assert f"no target return is taken by {cloned} (bc)" in refused("evaluate", cloned, *asked)
+    assert "is taken by bc" in refused("ope", cloned, folder / "store", "--target", 100)
     said = control("evaluate", cloned, folder / "store-run", *asked)[1]
     assert f"note: --target does nothing for {cloned} (bc)" in said
 
@@ -86,8 +87,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     out = tmp_path / "rows.json"
     control("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
     (row,) = read_results(out)
-    planted = {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
-    assert row.details["distractors"] == [planted]
+    assert [[*d.values()] for d in row.details["distractors"]] == [[11, 0.15, 0, False]]
     env = make_env("Hopper-v5", 2, [0.0])
     steps: list[Step] = []
     rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)

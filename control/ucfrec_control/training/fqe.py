@@ -18,6 +18,7 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
+from ucfrec.processes import progress
 from ucfrec_control.training.evaluate import Trained
 from ucfrec_control.training.rl_baselines import RLPolicy
 
@@ -59,19 +60,21 @@ def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeSt
     if isinstance(trained, RLPolicy):
         return trained.act(store.column(schema.OBSERVATION), np.ones(store.n_steps, dtype=bool))[0]
     scorer, parts = trained.scorer(rule), []
-    for first in range(0, store.n_steps, _BATCH):
-        episodes, steps = store.locate(np.arange(first, min(first + _BATCH, store.n_steps)))
-        logged = store.windows(episodes, steps, trained.policy.config.context)
-        sessions = Sessions(
-            logged.actions[:, :-1],
-            logged.rewards[:, :-1],
-            torch.from_numpy(steps),
-            torch.from_numpy(store.rewards_before(episodes, steps)),
-            torch.full((len(steps),), -1),
-            torch.zeros(len(steps), dtype=torch.int64),
-            states=logged.states,
-        )
-        parts.append(scorer.act(sessions).numpy())
+    with progress(store.n_steps, "actions of the policy", "steps") as bar:
+        for first in range(0, store.n_steps, _BATCH):
+            episodes, steps = store.locate(np.arange(first, min(first + _BATCH, store.n_steps)))
+            logged = store.windows(episodes, steps, trained.policy.config.context)
+            sessions = Sessions(
+                logged.actions[:, :-1],
+                logged.rewards[:, :-1],
+                torch.from_numpy(steps),
+                torch.from_numpy(store.rewards_before(episodes, steps)),
+                torch.full((len(steps),), -1),
+                torch.zeros(len(steps), dtype=torch.int64),
+                states=logged.states,
+            )
+            parts.append(scorer.act(sessions).numpy())
+            bar.update(len(steps))
     return np.concatenate(parts)
 
 

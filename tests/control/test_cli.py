@@ -40,7 +40,7 @@ def test_seeds_that_are_none_are_refused() -> None:
         ("benchmark --seeds 0", "--seeds: 0 is not"),
         ("benchmark --file nowhere", "nowhere.hdf5 does not exist"),
         ("benchmark --results rows.jsonl", "rows.jsonl, line 1 is not a result row"),
-        ("benchmark --workers 0", "--workers: 0 is not"),
+        ("figures --out out", "name runs with --runs, or"),
         ("figures --out out --results no.jsonl", "check the path"),
         ("figures --out out --results {}.json", "{}.json holds no list of result rows"),
         ("figures --out out --results [1].json", "[1].json, row 1 is not a result row"),

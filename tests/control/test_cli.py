@@ -11,16 +11,9 @@ ZOO_FILE = "hopper_medium-zoo"
 
 
 def test_seeds_that_are_none_are_refused() -> None:
-    for command, seed in product(
-        (
-            "evaluate run --seed",
-            "distract store --out out --seed",
-            "screen store --seed",
-            "collect --agent a.zip --env Hopper-v5 --out out --seed",
-            "benchmark --data data --evaluation-seed",
-        ),
-        ("-1", "4294967296", "1.5", "9" * 5000),
-    ):
+    commands = ("evaluate run --seed", "distract store --out out --seed", "screen store --seed")
+    commands += ("collect --agent a --env E --out out --seed", "benchmark --evaluation-seed")
+    for command, seed in product(commands, ("-1", "4294967296", "1.5", "9" * 5000)):
         assert "not a whole number from 0 to 4294967295" in refused(*command.split(), seed)
 
 
@@ -28,6 +21,7 @@ def test_seeds_that_are_none_are_refused() -> None:
     ("command", "says"),
     [
         ("prepare nowhere.hdf5 --out s", "nowhere.hdf5 does not exist"),
+        ("prepare . --out s", ". is not an HDF5 file"),
         ("prepare mujoco/hopper/expert-v9 --out s", "--download"),
         ("train nowhere --out run", "nowhere is not an episode store"),
         ("train store --out run --policy popular", "invalid choice: 'popular'"),
@@ -46,7 +40,7 @@ def test_seeds_that_are_none_are_refused() -> None:
         ("benchmark --seeds 0", "--seeds: 0 is not"),
         ("benchmark --file nowhere", "nowhere.hdf5 does not exist"),
         ("benchmark --results rows.jsonl", "rows.jsonl, line 1 is not a result row"),
-        ("benchmark --workers 0", "--workers: 0 is not"),
+        ("figures --out out", "name runs with --runs, or"),
         ("figures --out out --results no.jsonl", "check the path"),
         ("figures --out out --results {}.json", "{}.json holds no list of result rows"),
         ("figures --out out --results [1].json", "[1].json, row 1 is not a result row"),

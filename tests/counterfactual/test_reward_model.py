@@ -10,6 +10,7 @@ from torch.distributions import Normal, kl_divergence
 
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm, fit_warning
+from ucfrec.errors import InputError
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 
@@ -54,9 +55,12 @@ def test_a_reward_without_disturbance_collapses_and_the_report_warns(tmp_path: P
 def test_a_model_of_unpredictable_rewards_gives_a_warning(tmp_path: Path) -> None:
     train, held_out = planted(4_000, 0).transitions, planted(4_000, 1).transitions
     generator = torch.Generator().manual_seed(0)
-    train = replace(train, rewards=torch.randn(4_000, generator=generator))
-    held_out = replace(held_out, rewards=torch.randn(4_000, generator=generator))
+    train = replace(train, rewards=1e-9 * torch.randn(4_000, generator=generator))
+    held_out = replace(held_out, rewards=1e-9 * torch.randn(4_000, generator=generator))
     _, report = fit_crm(train, held_out, replace(FIT, epochs=2, hidden=32), tmp_path, seed=0)
+    assert report.reward_std == pytest.approx(1e-9, rel=0.1)
+    with pytest.raises(InputError, match="are equal, or nearly so"):
+        fit_crm(replace(train, rewards=train.rewards + 1), held_out, FIT, tmp_path, seed=0)
     assert report.r2_without_z < 0.02
     assert fit_warning(report.r2_without_z).startswith("the reward model predicts nothing")
     assert fit_warning(0.021) == ""

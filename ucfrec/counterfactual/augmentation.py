@@ -50,8 +50,7 @@ _ACTION_STREAM = 1
 _DELTA_LEVEL = "0.95"
 _LESS = 1 - 1e-9
 """Factor of a gate's limits, so that a rounding error does not let a proposal pass."""
-_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_BINS = 20
+_QUANTILES, _BINS = (0.05, 0.25, 0.5, 0.75, 0.95), 20
 _Edits = tuple[IntArray, IntArray, IntArray, Float32Array]
 """M accepted edits: position of the episode in the view, copy, step, state (M, S)."""
 
@@ -146,15 +145,12 @@ class AugmentationReport:
 
 
 def require_rewards_vary(train: EpisodeStore) -> None:
-    """Check that the training rewards are not all equal, which a reward model cannot learn from.
-    InputError if all training rewards are equal."""
-    rewards = train.column_batches(schema.REWARD)
-    values = np.unique([extreme for (part,) in rewards for extreme in (part.min(), part.max())])
-    if len(values) == 1:
+    """InputError if all training rewards are equal, which a reward model cannot learn from."""
+    rewards = train.column(schema.REWARD)
+    if rewards.min() == rewards.max():
         raise InputError(
-            f"all {train.n_steps:,} training rewards of {train.path} equal {values[0]:g}: there is "
-            "nothing for a reward model to learn; check the reward expression, or set "
-            "augment.copies=0"
+            f"all {train.n_steps:,} training rewards of {train.path} equal {rewards[0]:g}: there "
+            "is nothing for a reward model to learn; check the rewards, or set augment.copies=0"
         )
 
 

@@ -26,7 +26,7 @@ from ucfrec.settings import (
     settings_table,
 )
 
-_TINY = 1e-12
+_TINY = 1e-24
 Length = Annotated[float, Field(ge=0, le=1e6)]
 
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
+from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_weights
 from ucfrec.fitting.loop import Fit, LoopConfig, fit, load_trained
@@ -25,8 +26,7 @@ from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width,
 _LOG_2PI = math.log(2 * math.pi)
 INITIAL = "initial.safetensors"
 """Weights of an older reward model, in the folder of the new one."""
-_ACTIVE_NATS = 0.01
-_LEAK = 0.1
+_ACTIVE_NATS, _LEAK = 0.01, 0.1
 _PREDICTS_NOTHING = 0.02
 """R² on held-out steps at or below which a reward model counts as useless."""
 _QUANTILES = (0.5, 0.9, 0.95, 0.99)
@@ -39,8 +39,7 @@ _REGRESSION_RATE = 0.5
 _REGRESSION_SHARES = (6, 3, 1)
 """The regression is fitted by this part of the updates, one after the other, while that helps."""
 _VALIDATION_LIMIT = 20_000
-_CHUNK = 16_384
-_AT_ONCE = 1024
+_CHUNK, _AT_ONCE = 16_384, 1024
 _CPU = torch.device("cpu")
 _Rows = tuple[Tensor, ...]
 
@@ -276,9 +275,14 @@ def fit_crm(
         values = getattr(train, f"{name}s").double()
         average, std = values.mean(dim=0), values.std(dim=0, correction=0)
         # Rounding errors become 0.
-        std = torch.where(std > _CONSTANT * average.abs().clamp(min=1.0), std, 0.0)
+        std = torch.where(std > _CONSTANT * average.abs().clamp(min=_CONSTANT), std, 0.0)
         model.get_buffer(f"{name}_mean").copy_(average)
         model.get_buffer(f"{name}_std").copy_(std)
+    if not model.reward_std:
+        raise InputError(
+            f"the rewards of the {len(train.rewards):,} steps that the reward model learns from "
+            "are equal, or nearly so; raise crm.max_transitions, or set augment.copies=0"
+        )
     if (folder / INITIAL).exists():
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first:

@@ -62,7 +62,7 @@ class ConservativeQ(nn.Module):
         vectors = store.action_vectors(logged.long() if store.has_items else logged)
         every = store.item_states.embeddings if store.has_items else None
         self.register_buffer("state_mean", mean)
-        self.register_buffer("state_std", torch.where(std > 1e-6, std, 1.0))
+        self.register_buffer("state_std", torch.where(std > 0, std, 1.0))
         self.register_buffer("logged", vectors)
         self.register_buffer("every", every)
         self.register_buffer("low", vectors.min(0).values)

@@ -236,7 +236,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
     mean, std = train.state_statistics
     policy.state_mean.copy_(mean)
-    policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
+    policy.state_std.copy_(torch.where(std > 0, std, 1.0))
     returns_to_go = train.column(schema.RETURN_TO_GO)
     per_session = config.policy.returns(train.record.source.session_by).per_session
     scaled_by = train.returns if per_session else returns_to_go
@@ -253,7 +253,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     else:
         actions = train.column(schema.ACTION)
         largest = torch.from_numpy(np.abs(actions).max(0))
-        policy.head.scale.copy_(largest.clamp(min=1e-6))
+        policy.head.scale.copy_(largest.clamp(min=1e-30))
     policy.start_from(train)
     return policy
 

@@ -6,21 +6,12 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
 
 from ucfrec.benchmark.cells import PAPER_UCF, Budget, Cell, Method, Plan, Presets, Task
 from ucfrec.benchmark.grid import select_names
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
-from ucfrec_control.benchmark.methods import (
-    METHODS,
-    METHODS_WO_TIME,
-    ROBUST,
-    ROBUSTNESS,
-    SCORES,
-    TABLES,
-    Methods,
-)
+from ucfrec_control.benchmark.methods import METHODS, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, find_preset, preset_of
@@ -86,33 +77,10 @@ def _select(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Me
     return {name: methods[name] for name in select_names(methods, names, "method")}
 
 
-def _time_settings(settings: Sequence[str]) -> tuple[str, ...]:
-    return tuple(setting for setting in settings if setting.startswith("policy.max_timestep"))
-
-
-def _find_tuned() -> Methods:
-    """The methods of the main table that can have a learning rate of their own: one for each policy
-    with embeddings of time, and one without."""
-    methods: dict[tuple[str, tuple[str, ...]], str] = {}
-    for name, method in METHODS.items():
-        if not name.startswith(PAPER_UCF):
-            methods.setdefault((method.policy, _time_settings(method.settings)), name)
-    return {name: METHODS[name] for name in methods.values()}
-
-
-_TUNED: Final = _find_tuned()
-SEARCHED: Final = {
-    name: method
-    for name, method in _TUNED.items()
-    if METHODS_WO_TIME.get(method.policy, name) == name
-}
-"""The methods whose learning rate is searched; others take the rate chosen for their policy."""
-
-
 @cache
 def chosen_rates(budget: str) -> Mapping[str, float]:
-    """The learning rate of each method of `SEARCHED`, chosen on validation loss;
-    empty for a budget without a search."""
+    """Learning rates of some methods, one of each policy, chosen on validation loss; empty for a
+    budget without a search."""
     text = files("ucfrec_control.benchmark").joinpath("rates.toml").read_text(encoding="utf-8")
     rates: Mapping[str, float] = tomllib.loads(text).get(budget, {})
     return rates
@@ -133,13 +101,6 @@ def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
 
 
 def _rate_of(budget: Budget, method: Method) -> float | None:
-    """The chosen rate of a method, or of another one of its policy; None if there is none."""
-    time = _time_settings(method.settings)
-    if method.policy == "ucf" and time == _time_settings(METHODS["dt-wo-time"].settings):
-        time = ()  # the preset
-    rates, same_policy = chosen_rates(budget.name), []
-    for name, tuned in _TUNED.items():
-        if (tuned.policy, _time_settings(tuned.settings)) == (method.policy, time):
-            same_policy.append(name)
-    same_policy += [name for name, tuned in SEARCHED.items() if tuned.policy == method.policy]
-    return next((rates[name] for name in same_policy if name in rates), None)
+    """The rate chosen for a method of the same policy; None if there is none."""
+    rates = chosen_rates(budget.name).items()
+    return next((rate for name, rate in rates if METHODS[name].policy == method.policy), None)

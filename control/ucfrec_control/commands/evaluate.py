@@ -31,7 +31,7 @@ class Evaluate(Table):
     episodes: Annotated[int, POSITIVE] = 20
     """Episodes of each policy and target."""
     seed: Annotated[int, SEED] = 0
-    """Of the episodes."""
+    """Of the episodes: environments have this seed and up to 49 more, so others begin 50 later"""
     target: Annotated[Sequence[float], target_given] = ()
     """Target return; repeatable (default: the preset's, else the largest of the training)"""
     checkpoint: Literal["both", "best", "last", "return"] = "both"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ucfrec.commands.options import Table
+from ucfrec.errors import InputError
 
 
 class Figures(Table):
@@ -19,7 +20,9 @@ class Figures(Table):
     """Folder of the figures."""
 
     def execute(self) -> None:
-        """Run `ucfrec-control figures`."""
+        """Run `ucfrec-control figures`. InputError without runs and rows."""
+        if not (self.runs or self.results):
+            raise InputError("name runs with --runs, or files of rows with --results")
         # matplotlib takes half a second to import
         from ucfrec_control.figures.figures import make_figures
 

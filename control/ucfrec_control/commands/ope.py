@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from ucfrec.commands.options import ARGUMENT, Table
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec_control.training.evaluate import load_run, rules_of
+from ucfrec_control.training.evaluate import choose_rule, load_run
 from ucfrec_control.training.fqe import estimate
 
 
@@ -26,7 +26,7 @@ class Ope(Table):
     def execute(self) -> None:
         """Run `ucfrec-control ope`."""
         trained = load_run(self.run, self.checkpoint)
-        rule = rules_of(trained, None, () if self.target is None else (self.target,))[0]
+        rule = choose_rule(trained, self.target)
         result = estimate(trained, rule, EpisodeStore.open(self.store), self.discount)
         for reason in result.reasons:
             print(f"do not rely on the estimate: {reason}")

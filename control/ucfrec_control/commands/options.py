@@ -79,7 +79,7 @@ class ControlGridOptions(GridOptions):
     """Numbers of the policies' products; bfloat16 is for CPUs with avx512_bf16 or AMX, and GPUs"""
     budget: Literal["small", "medium", "full"] = "small"
     """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
-    times the windows; about 25 core hours for the main table), full (the steps, seeds and episodes
+    times the windows, about 25 core hours for the main table), full (the steps, seeds and episodes
     of the papers)"""
     seeds: Annotated[int | None, POSITIVE] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""
@@ -123,8 +123,8 @@ class SuiteOptions(ControlGridOptions):
     method: Annotated[Sequence[str], "NAME"] = ()
     """Measure only this method; repeatable (default: all of the budget)"""
     evaluation_seed: Annotated[int | None, SEED, "SEED"] = None
-    """Seed of the evaluated episodes; the same for every training seed (default: set by
-    --budget)"""
+    """Seed of the evaluated episodes, as of evaluate; the same for every training seed (default:
+    set by --budget)"""
 
     def make_suite_rows(
         self,

@@ -1,5 +1,6 @@
 """`ucfrec-control train`: train a policy on a store; resumes."""
 
+import warnings
 from typing import Annotated, Literal
 
 import torch
@@ -7,7 +8,7 @@ import torch
 from ucfrec.commands.options import POSITIVE, Names
 from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.environments.environments import environment_of_data, make_env
@@ -45,6 +46,10 @@ class Train(TrainingOptions):
         store = EpisodeStore.open(self.store)
         preset = preset_of(dataset_of(store), self.policy)
         config = resolve_config(self.policy, self.config, self.set, self.seed, preset.tables)
+        steps, warmup = config.train.steps, config.train.warmup
+        if warmup >= steps:
+            note = f"the learning rate rises to the end: train.warmup_steps is {warmup}, of {steps}"
+            warnings.warn(f"{note} train.steps; set fewer, such as {steps // 20}", InputNote, 2)
         callbacks = SILENT
         if self.select_by_return is not None:
             env_id = self.env or environment_of_data(dataset_of(store))

@@ -147,7 +147,7 @@ def _timeouts(steps: Mapping[str, Array], path: Path) -> BoolArray:
     if "next_observations" not in steps:
         raise InputError(
             f"{path} has neither timeouts nor next_observations, so nothing shows where its "
-            "trajectories end; use a later release of the dataset"
+            "trajectories end; use a later release of D4RL, or write timeouts, false without limit"
         )
     goes_on = (steps["next_observations"][:-1] == steps["observations"][1:]).all(axis=1)
     return np.append(~goes_on, False)
@@ -170,7 +170,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     is missing, damaged or not HDF5, links to another file or stores values in one, or reading it in
     the block fails."""
     if not path.is_file():
-        raise InputError(f"{path} does not exist")
+        raise InputError(f"{path} {'is not an HDF5 file' if path.exists() else 'does not exist'}")
     try:
         # HDF5's own lock needs a writable file system and would only keep out other HDF5 writers.
         with h5py.File(path, "r", locking=False) as file:

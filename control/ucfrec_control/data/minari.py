@@ -214,7 +214,7 @@ def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
     try:
         return gymnasium.spec(env_id)
     except gymnasium.error.Error as error:
-        raise InputError(f"the environment {env_id} is not known here ({error})") from None
+        raise InputError(f"the environment {env_id} is not known ({error}); give --env") from None
 
 
 def _box(size: int) -> gymnasium.spaces.Box:

@@ -108,6 +108,8 @@ class Trajectories:
         for name, (values, shape) in shapes.items():
             if values.shape != shape:
                 raise InputError(f"{where}: {name} have shape {values.shape} instead of {shape}")
+            if not values.size:
+                raise InputError(f"{where}: {name} have shape {values.shape}, so no numbers")
             non_finite = int(np.count_nonzero(~np.isfinite(values)))
             if non_finite:
                 raise InputError(

@@ -54,11 +54,12 @@ def evaluate_run(
     """One result row for each checkpoint and target return; a score where reference returns are
     known, the return otherwise.
 
-    All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
-    checkpoint; they and behaviour cloning take no target return.
+    All rows have the same initial states, after `SIDE_BY_SIDE` episodes if steps draw no random
+    numbers. Distractors are fixed. IQL and CQL keep only their last checkpoint; they and behaviour
+    cloning take no target return.
 
     Args:
-        seed: of the environments and the bootstrap.
+        seed: of the first environment and the bootstrap; the next environment has the next seed.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns; empty for those of the preset, else the run's own.
         checkpoints: of "last", "best" and, where the training selected by return, "return".
@@ -173,6 +174,17 @@ def rules_of(
     task = find_task(env_id or dataset["env_id"] or dataset["dataset"])
     targets = targets or find_preset(task.name if task else "", kind, method).targets
     return [DecisionRule(target) for target in targets] or [trained.rule]
+
+
+def choose_rule(
+    trained: Trained, target: float | None = None, env_id: str | None = None
+) -> DecisionRule | None:
+    """The rule of one target return; with None, the first of `rules_of`. InputError if there is a
+    target return, but the policy takes none."""
+    if target is not None and not takes_target(trained.record):
+        name = trained.record.config.policy_name
+        raise InputError(f"no target return is taken by {name}; leave the target out")
+    return rules_of(trained, env_id, () if target is None else (target,))[0]
 
 
 def play(

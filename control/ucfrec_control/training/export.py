@@ -20,7 +20,7 @@ from ucfrec.recommending.export import (
     write_graph,
 )
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.training.evaluate import load_run, rules_of
+from ucfrec_control.training.evaluate import choose_rule, load_run
 
 _MEANINGS: Final = {
     "observations": "of the last K steps, the one to decide included and last; any finite numbers "
@@ -77,7 +77,7 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
     trained = load_run(run, checkpoint)
     if not isinstance(trained, TrainedPolicy):
         raise InputError(f"{run} is of IQL or CQL; export it with d3rlpy, or {_REMEDY}")
-    (rule, *_) = rules_of(trained, None)
+    rule = choose_rule(trained)
     require_installed()
     graph = WindowGraph(trained).eval()
     arguments, batch = _draw_windows(graph, trained, 3), torch.export.Dim("batch", min=1, max=2**20)
@@ -91,7 +91,7 @@ def export_run(run: Path, out: Path, checkpoint: str = "last") -> float:
             with torch.no_grad():
                 expected = graph(**arguments)
             fed = {name: value.numpy() for name, value in arguments.items() if name in input_names}
-            size = max(float(expected.abs().max()), 1e-6)
+            size = max(float(expected.abs().max()), 1e-30)
             pairs = zip(runner.run(None, fed), [expected], strict=True)
             difference = max(difference, require_close(pairs, _REMEDY, size))
         description: dict[str, Any] = {

@@ -18,6 +18,7 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
+from ucfrec.processes import progress
 from ucfrec_control.training.evaluate import Trained
 from ucfrec_control.training.rl_baselines import RLPolicy
 
@@ -59,19 +60,21 @@ def choose_actions(trained: Trained, rule: DecisionRule | None, store: EpisodeSt
     if isinstance(trained, RLPolicy):
         return trained.act(store.column(schema.OBSERVATION), np.ones(store.n_steps, dtype=bool))[0]
     scorer, parts = trained.scorer(rule), []
-    for first in range(0, store.n_steps, _BATCH):
-        episodes, steps = store.locate(np.arange(first, min(first + _BATCH, store.n_steps)))
-        logged = store.windows(episodes, steps, trained.policy.config.context)
-        sessions = Sessions(
-            logged.actions[:, :-1],
-            logged.rewards[:, :-1],
-            torch.from_numpy(steps),
-            torch.from_numpy(store.rewards_before(episodes, steps)),
-            torch.full((len(steps),), -1),
-            torch.zeros(len(steps), dtype=torch.int64),
-            states=logged.states,
-        )
-        parts.append(scorer.act(sessions).numpy())
+    with progress(store.n_steps, "actions of the policy", "steps") as bar:
+        for first in range(0, store.n_steps, _BATCH):
+            episodes, steps = store.locate(np.arange(first, min(first + _BATCH, store.n_steps)))
+            logged = store.windows(episodes, steps, trained.policy.config.context)
+            sessions = Sessions(
+                logged.actions[:, :-1],
+                logged.rewards[:, :-1],
+                torch.from_numpy(steps),
+                torch.from_numpy(store.rewards_before(episodes, steps)),
+                torch.full((len(steps),), -1),
+                torch.zeros(len(steps), dtype=torch.int64),
+                states=logged.states,
+            )
+            parts.append(scorer.act(sessions).numpy())
+            bar.update(len(steps))
     return np.concatenate(parts)
 
 
@@ -100,9 +103,9 @@ def estimate(
     if store.lengths.max() < 2:
         raise InputError(f"{store.path}: no trajectory has two steps; log longer ones")
     logged, chosen = store.column(schema.ACTION), choose_actions(trained, rule, store)
-    model, variance = _Model(store, discount), logged.var(axis=0)
-    apart = np.square(chosen - logged).mean(axis=0)[variance > 0]
-    distance = float((apart / variance[variance > 0]).mean()) if len(apart) else 0.0
+    model, moving = _Model(store, discount), np.ptp(logged, axis=0) > 0
+    apart = (np.square(chosen - logged) / model.action_scale**2).mean(axis=0)[moving]
+    distance = float(apart.mean()) if len(apart) else 0.0
     of_behaviour, of_policy = model.fit(logged, to_limit=True), model.fit(chosen)
     converged = of_policy.converged and of_behaviour.converged
     has_few = len(store.lengths) < _GROUPS
@@ -160,10 +163,13 @@ class _Model:
         self._lengths, self._discount = store.lengths, discount
         self._starts = np.cumsum(self._lengths) - self._lengths
         mean, std = (values.numpy() for values in store.state_statistics)
-        self._states = (store.column(schema.OBSERVATION) - mean) / np.where(std > 1e-6, std, 1.0)
+        self._states = (store.column(schema.OBSERVATION) - mean) / np.where(std > 0, std, 1.0)
         self._rewards = store.column(schema.REWARD).astype(np.float64)
         self._logged = store.column(schema.ACTION)
-        self._scale = np.maximum(self._logged.std(axis=0), 1e-6)
+        # In float32, sums of a million actions near 1000 are off by more than their spread.
+        spread = self._logged.std(axis=0, dtype=np.float64)
+        self._action_mean = self._logged.mean(axis=0, dtype=np.float64)
+        self.action_scale = np.where(np.ptp(self._logged, axis=0) > 0, spread, 1.0)
         size, rng = self._states.shape[1] + self._logged.shape[1], np.random.default_rng(0)
         waves = min(_FEATURES, store.n_steps // _STEPS_PER_FEATURE)
         self._slopes = rng.normal(0, size**-0.5, (size, waves))
@@ -177,7 +183,8 @@ class _Model:
 
     def _features(self, rows: IntArray, actions: Array) -> Float64Array:
         """φ (M, F) of steps `rows` (M,) with the actions (N, A) of all steps."""
-        inputs = np.hstack([self._states[rows], actions[rows] / self._scale]).astype(np.float64)
+        acted = (actions[rows] - self._action_mean) / self.action_scale
+        inputs = np.hstack([self._states[rows].astype(np.float64), acted])
         waves = np.cos(inputs @ self._slopes + self._phases)
         return np.hstack([waves, inputs, np.ones((len(rows), 1))])
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
-from ucfrec_control.training.evaluate import Trained, load_run, rules_of
+from ucfrec_control.training.evaluate import Trained, choose_rule, load_run
 
 
 class ControlPolicy:
@@ -36,10 +36,11 @@ class ControlPolicy:
                 return where the training selected by it.
 
         Raises:
-            InputError: `run` is not such a run, or its training has not ended.
+            InputError: `run` is not such a run, its training has not ended, or its policy takes no
+                target return, but one is given.
         """
         trained = load_run(Path(run), checkpoint)
-        return cls(trained, rules_of(trained, None, () if target is None else (target,))[0])
+        return cls(trained, choose_rule(trained, target))
 
     def reset(self) -> None:
         """Begin an episode."""

@@ -225,7 +225,7 @@ class _Data:
         now = view.transitions(self.episodes, steps)
         then = view.transitions(self.episodes, steps + 1)
         mean, std = view.state_statistics
-        scale = torch.where(std > 1e-6, std, 1.0)
+        scale = torch.where(std > 0, std, 1.0)
         states = (now.states - mean) / scale
         self.states, self.size = states.clamp(-_CLIP, _CLIP), states.shape[1]
         self.actions = _standardise(now.actions)
@@ -308,7 +308,8 @@ def _measures(data: _Data, dimension: int, without: Collection[int]) -> bool:
 def _standardise(values: Tensor) -> Tensor:
     """Columns with mean 0 and standard deviation 1, clipped; constant ones are 0."""
     std, mean = torch.std_mean(values, dim=0)
-    return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-_CLIP, _CLIP)
+    constant = values.amax(0) == values.amin(0)
+    return ((values - mean) / std.masked_fill(constant, torch.inf)).clamp(-_CLIP, _CLIP)
 
 
 def _compute_p_value(differences: Tensor, episodes: IntArray) -> float:

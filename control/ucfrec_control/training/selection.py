@@ -7,7 +7,7 @@ from typing import Final
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.training.evaluate import RETURN, play, rules_of
+from ucfrec_control.training.evaluate import RETURN, choose_rule, play
 
 _SEED: Final = 500_000
 """Of the validation episodes, which are others than those that are reported."""
@@ -21,7 +21,7 @@ def select_by_return(run: Path, env_id: str, episodes: int) -> Callbacks:
 
     def on_validation(step: int, logged: Mapping[str, float]) -> None:
         trained = TrainedPolicy.load(run, "last", in_training=True)
-        rule = rules_of(trained, env_id)[0]
+        rule = choose_rule(trained, env_id=env_id)
         mean = float(play(trained, env_id, rule, episodes, _SEED).returns.mean())
         if not path.exists() or mean > load_tensors(path)[1]["return"]:
             save_tensors(path, trained.policy.state_dict(), {"step": step, "return": mean})

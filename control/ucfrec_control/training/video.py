@@ -17,7 +17,12 @@ from matplotlib.image import imsave
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.training.evaluate import environment_of, load_run, open_environment, rules_of
+from ucfrec_control.training.evaluate import (
+    choose_rule,
+    environment_of,
+    load_run,
+    open_environment,
+)
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
@@ -53,7 +58,7 @@ def record_episode(
         raise InputError(f"{out} exists already; remove it or name another with --video")
     trained = load_run(run, checkpoint)
     environment = environment_of(trained, env_id)
-    rule = rules_of(trained, environment, () if target is None else (target,))[0]
+    rule = choose_rule(trained, target, environment)
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:

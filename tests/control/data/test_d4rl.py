@@ -29,6 +29,7 @@ from ucfrec_control.data.minari import read_minari, write_minari
 from ucfrec_control.environments.scores import find_kind, find_task
 
 LENGTHS, FINAL = (4, 1, 6, 3), "infos/final_observations"
+SEEN = ("observations", "next_observations", FINAL)
 
 
 @pytest.fixture(autouse=True)
@@ -139,10 +140,7 @@ def with_one(value: float) -> Callable[[Array], Array]:
         ({"rewards": with_one(-1e300)}, "1 number of its rewards is beyond single precision"),
         (dict.fromkeys(("terminals", "timeouts"), np.zeros_like), "no trajectory ends in it"),
         ({"next_observations": None, FINAL: lambda v: v[1:]}, "has 3 rows for 4 trajectories"),
-        (
-            dict.fromkeys(("observations", "next_observations", FINAL), lambda v: v[:, :5]),
-            r"sizes \(5, 3\), those of hopper are \(11, 3\)",
-        ),
+        (dict.fromkeys(SEEN, lambda v: v[:, :5]), r"sizes \(5, 3\), those of hopper are \(11, 3\)"),
     ],
 )
 def test_other_layouts_are_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
@@ -212,8 +210,7 @@ def test_links_in_groups_are_found_and_what_compresses_well_is_read(tmp_path: Pa
 def test_data_of_other_sizes_than_the_named_environment_is_refused(file: Path) -> None:
     write_minari(read_d4rl(file), "hopper/mine-v0")
     for source in (file, "hopper/mine-v0"):
-        asked = ("prepare", source, "--out", file.parent / "store", "--env")
-        said = refused(*asked, "HalfCheetah-v5")
+        said = refused("prepare", source, "--out", file.parent / "s", "--env", "HalfCheetah-v5")
         assert "(11, 3), those of halfcheetah are (17, 6)" in said
 
 

@@ -26,13 +26,14 @@ def simulate(gain: float, noise: float, episodes: int, seed: int) -> tuple[np.nd
 @pytest.mark.parametrize("gain", [0.0, 0.5])
 def test_a_value_is_within_its_interval_of_the_simulated_one(tmp_path: Path, gain: float) -> None:
     states, actions, rewards = simulate(0.2, 0.4, 200, seed=0)
-    flat = [values.reshape(-1, 1).astype(np.float32) for values in (states, actions)]
+    # Neither the unit of what was observed nor the middle of the actions matters.
+    flat = [v.reshape(-1, 1).astype(np.float32) for v in (states / 2**30, 1000 + actions)]
     lengths, cut = np.full(200, STEPS), np.zeros(200, dtype=bool)
     source = {"where": "here", "dataset": "line", "env_id": None, "versions": {}}
     logged = rewards.ravel().astype(np.float32)
     Trajectories(*flat, logged, lengths, cut, None, source).write_store(tmp_path / "store")
     model = _Model(EpisodeStore.open(tmp_path / "store"), DISCOUNT)
-    fit = model.fit(-gain * flat[0])
+    fit = model.fit(1000 - gain * 2**30 * flat[0])
     assert fit.converged
     # All states of a policy count, so the simulated episodes have to last as long as they can.
     later = np.concatenate([simulate(gain, 0.0, 4000, seed)[2] for seed in (1, 2)])

@@ -60,8 +60,7 @@ def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> No
 
 
 def test_another_environment_version_warns(folder: Path) -> None:
-    asked = (*LAST, "--target", 100, "--env", "Hopper-v4")
-    said = control("evaluate", folder / "store-run", *asked)[1]
+    said = control("evaluate", folder / "store-run", *LAST, "--target", 9, "--env", "Hopper-v4")[1]
     assert "warning: the data is of Hopper-v5, the evaluation is in Hopper-v4" in said
     assert not mismatches({"env_id": "Tank-v0", "versions": {}}, "mine:Tank-v0")
 
@@ -72,6 +71,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
     (row,) = evaluate_run(cloned, episodes=1, seed=0, checkpoints=("last",))
     assert (row["target_return"], row["rule"]) == (None, "no target return")
     assert f"no target return is taken by {cloned} (bc)" in refused("evaluate", cloned, *asked)
+    assert "is taken by bc" in refused("ope", cloned, folder / "store", "--target", 100)
     said = control("evaluate", cloned, folder / "store-run", *asked)[1]
     assert f"note: --target does nothing for {cloned} (bc)" in said
 
@@ -79,8 +79,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
 def test_data_runs_no_code(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "theirs.py").write_text("raise SystemExit('their code ran')")
     monkeypatch.syspath_prepend(tmp_path)
-    entry = ("data", "env_id")
-    run = changed(folder / "store-run", tmp_path / "run", entry, "theirs:Hopper-v5")
+    run = changed(folder / "store-run", tmp_path / "run", ("data", "env_id"), "theirs:Hopper-v5")
     assert "the Python module theirs would be run" in refused("evaluate", run, "--episodes", 1)
 
 
@@ -88,8 +87,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     out = tmp_path / "rows.json"
     control("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
     (row,) = read_results(out)
-    planted = {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
-    assert row.details["distractors"] == [planted]
+    assert [[*d.values()] for d in row.details["distractors"]] == [[11, 0.15, 0, False]]
     env = make_env("Hopper-v5", 2, [0.0])
     steps: list[Step] = []
     rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)

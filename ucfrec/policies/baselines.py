@@ -263,8 +263,10 @@ class ItemKNNPolicy(ScoringPolicy):
         liked = sparse.csr_matrix(
             (rewards - float(self.reward_low), (episodes, items)), shape=shape
         )
-        lengths = np.sqrt(np.asarray(liked.multiply(liked).sum(axis=0))).ravel()
-        columns = (liked @ sparse.diags(1 / np.where(lengths > 0, lengths, 1.0))).tocsc()
+        squares = np.asarray(liked.multiply(liked).sum(axis=0))
+        lengths = np.sqrt(squares).ravel()
+        scales = 1 / np.where(lengths > 0, lengths, 1.0)
+        columns = (liked @ sparse.diags(scales)).tocsc()
         at_once = max(1, min(_ROWS, _AT_ONCE // shape[1]))
         for start in range(0, shape[1], at_once):
             rows = slice(start, start + at_once)
@@ -284,7 +286,8 @@ class ItemKNNPolicy(ScoringPolicy):
     @torch.no_grad()
     def _choose_temperature(self, held_out: EpisodeStore) -> None:
         """Minimise the negative log-likelihood, convex in the temperature, by bisection."""
-        numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
+        count = min(held_out.n_steps, _ROWS)
+        numbers = np.linspace(0, held_out.n_steps - 1, count, dtype=np.int64)
         episodes, steps = held_out.locate(numbers)
         windows = held_out.windows(episodes, steps, self.config.context).to(self.cosines.device)
         shown = Shown.before_last(windows)
@@ -300,7 +303,8 @@ class ItemKNNPolicy(ScoringPolicy):
         high = _HOTTEST
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            expected = (middle * scores + bias).softmax(-1).mul(scores).sum(-1).mean()
+            probabilities = (middle * scores + bias).softmax(-1)
+            expected = probabilities.mul(scores).sum(-1).mean()
             low, high = (low, middle) if expected > of_shown else (middle, high)
         self.temperature.fill_((low + high) / 2)
 
@@ -426,8 +430,9 @@ class BoostedPolicy(ScoringPolicy):
         parts = (train.select(folds == fold) for fold in range(_FOLDS))
         of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
         whole = torch.stack([self.impressions, self.liked]).cpu()
-        # (2, folds, n_items) of the others.
-        inputs, liked = self._rows(train, numbers, whole.unsqueeze(1) - torch.stack(of_folds, 1))
+        # (2, folds, n_items).
+        of_others = whole.unsqueeze(1) - torch.stack(of_folds, 1)
+        inputs, liked = self._rows(train, numbers, of_others)
         episodes, steps = train.locate(numbers)
         items = train.items_at(episodes, steps)
         tags = train.item_states.tags.numpy().reshape(len(self.tag), -1)
@@ -501,14 +506,16 @@ class BoostedPolicy(ScoringPolicy):
         context = context[:, -1:, self._context :]  # (B, 1, F + O)
         effects = self.effects[items]
         pairs = effects[..., 0] + (effects[..., 1:] @ context.mT).squeeze(-1)
+        likeness_to_liked = (cosines @ liked.unsqueeze(-1)).squeeze(-1)
+        likeness = (cosines @ valid.unsqueeze(-1)).squeeze(-1)
         columns = (
             self._rate(liked_of, shown_of),
             torch.log1p(shown_of),
             self._rate(likes, count),
             count,
             liked[:, -1:] - 1 + valid[:, -1:] if earlier.shape[1] else none[:, :1],
-            _round((cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1)),
-            _round((cosines @ valid.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1)),
+            _round(likeness_to_liked / likes.clamp(min=1)),
+            _round(likeness / count.clamp(min=1)),
             cosines[..., -1] * valid[:, -1:] if earlier.shape[1] else none,
             torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
             tagged,
@@ -525,7 +532,8 @@ class BoostedPolicy(ScoringPolicy):
         tables = {name: table[: int(self.trees)].cpu() for name, table in buffers.items()}
         trees = BoostedTrees(**tables, base=self.base.cpu())
         parts = torch.split(inputs.flatten(0, 1).cpu(), _ROWS_AT_ONCE)
-        return torch.cat([trees(rows) for rows in parts]).view(inputs.shape[:2]).to(inputs)
+        scores = torch.cat([trees(rows) for rows in parts])
+        return scores.view(inputs.shape[:2]).to(inputs)
 
     @torch.no_grad()
     def act(self, windows: Windows) -> Tensor:
@@ -564,7 +572,8 @@ def _fit_pairs(
     weights = (columns > 0) | (np.arange(columns.shape[1]) == 0)
     bounds = np.arange(len(columns) + 1) * columns.shape[1]
     shape = (len(columns), int(columns.max()) + 1)
-    attributes = sparse.csr_matrix((weights.ravel().astype(float), columns.ravel(), bounds), shape)
+    entries = weights.ravel().astype(float)
+    attributes = sparse.csr_matrix((entries, columns.ravel(), bounds), shape)
     design, weighted = attributes[items], context.T * residuals
     spread, axes = np.linalg.eigh(context.T @ context)
     spreads, bases = np.linalg.eigh((design.T @ design).toarray() / len(items))
@@ -578,7 +587,8 @@ def _fit_pairs(
     predicted = np.zeros(len(items))
     for fold in range(_FOLDS):
         rows = folds == fold
-        predicted[rows] = (solve(~rows)[items[rows]] * context[rows]).sum(1)
+        effects = solve(~rows)[items[rows]]
+        predicted[rows] = (effects * context[rows]).sum(1)
     return predicted, solve(folds >= 0)
 
 

@@ -201,7 +201,8 @@ class _LongShortBlock(nn.Module):
         long, short = hidden.chunk(2, dim=-1)
         both = torch.cat([self.long(long, valid), self.short(short, valid)], dim=-1)
         squeezed = F.relu(self.squeeze(both))
-        gate = torch.cat([layer(squeezed) for layer in self.gates], dim=-1).softmax(-1)
+        gates = [layer(squeezed) for layer in self.gates]
+        gate = torch.cat(gates, dim=-1).softmax(-1)
         hidden = self.norm(hidden + self.dropout(self.out(gate * both)))
         return self.mlp_norm(hidden + self.mlp(hidden))  # type: ignore[no-any-return]
 

@@ -174,8 +174,10 @@ def optimistic_returns(
     next_values = np.append(values[1:], 0.0)
     next_values[ends - 1] = 0.0
     attainable = next_values + (total - first)  # V_{t+1} + C_{t+1}
-    highest = pd.Series(attainable[::-1]).groupby(owner[::-1]).cummax().to_numpy()[::-1]
-    return np.asarray(highest - (earlier - first), dtype=np.float32)
+    from_the_end = pd.Series(attainable[::-1])
+    highest = from_the_end.groupby(owner[::-1]).cummax()
+    in_order = highest.to_numpy()[::-1]
+    return np.asarray(in_order - (earlier - first), dtype=np.float32)
 
 
 @settings_table("policy")

@@ -392,7 +392,9 @@ def parent_targets(
     steps = torch.arange(mask.shape[1], device=mask.device)
     back = steps.unsqueeze(1) - steps  # (K, K) t − j
     of_states = decay ** back.clamp(min=0) * ((back >= 0) & (back <= window))
-    weights = torch.stack([(back == 0).float(), of_states, previous_action * (back == 1)], -1)
+    of_returns = (back == 0).float()
+    of_actions = previous_action * (back == 1)
+    weights = torch.stack([of_returns, of_states, of_actions], -1)
     valid = mask.unsqueeze(1) & mask.unsqueeze(2)
     targets = (weights * valid.unsqueeze(3)).flatten(2)
     return targets / targets.sum(-1, keepdim=True).clamp(min=EPSILON)

@@ -1,5 +1,4 @@
-"""A policy acts on what it was trained on: windows gathered from the logs of its own sessions give
-the actions that it took."""
+"""Windows gathered from the logs of a policy's own sessions give the actions that it took."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Scores are those of a naive computation, wherever the rule acts: simulated, scored, ranked and
-recommended."""
+"""Scores are those of a naive computation: simulated, scored, ranked and recommended."""
 
 from collections.abc import Iterator
 from dataclasses import replace

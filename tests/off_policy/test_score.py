@@ -139,8 +139,7 @@ def test_unknown_items_are_counted(log: pd.DataFrame, trained: TrainedPolicy, re
 def test_unknown_items_may_stay_with_no_probability(
     log: pd.DataFrame, trained: TrainedPolicy, logged: LoggedSessions, read: Read
 ) -> None:
-    """Every third row shows something new: its probability is 0, and what came before in the
-    session is evaluated as usual."""
+    """Every third row has a new item, of probability 0; rows before it are evaluated as usual."""
     new = np.arange(len(log)) % 3 == 0
     before = collect_steps(trained, logged, RULE, seed=0)[0]
     with read(log.assign(item_id=np.where(new, 999, log.item_id)), keep=True) as kept:

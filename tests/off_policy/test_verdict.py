@@ -66,8 +66,7 @@ def test_good_logs_stand_and_say_what_the_policy_gains() -> None:
 
 
 def test_unknown_items_weigh_nothing() -> None:
-    """Half the logged items are none of the policy's. Dropping these rows would take the mean over
-    the rest, twice too much."""
+    """The policy lacks half the logged items. Without these rows, the mean is twice too much."""
     steps, items = logs(5000)
     known = np.arange(ITEMS) < 5
     target = np.where(known, 0.2, 0.0)

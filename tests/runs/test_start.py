@@ -124,8 +124,7 @@ def train(store: Path, run: Path, *settings: str) -> None:
 
 
 def same(found: Path, expected: Path) -> None:
-    """Runs of the same files and curves. Weights without effect, whose gradients are rounding
-    errors, differ."""
+    """Files and curves are the same. Weights whose gradients are rounding errors differ."""
     curves, others = (read_metrics(run / "policy") for run in (found, expected))
     for name in ("loss", "validation_loss", "action_loss", "gradient_norm"):
         assert curves[name] == pytest.approx(others[name], rel=1e-4)

@@ -12,9 +12,8 @@ ITEMS = 4
 
 class Echo(gymnasium.Env[Any, Any]):
     """Five steps; the reward of item a is a, that of a vector its sum. Observed are a session's
-    `secret` number and the category `step`, with `whole` the latter alone; `notes` adds an entry of
-    no fixed size. `users` is the `user_id` of every `info`, `visitors` those of one session after
-    the other, told by `reset` alone."""
+    `secret` number and the category `step`, with `whole` only that; `notes` has no fixed size.
+    `users` is the `user_id` of every `info`; `reset` tells `visitors`, of a session each."""
 
     def __init__(self, actions: Any, whole=False, users=None, notes=False, visitors=()) -> None:
         self.action_space, self._whole, self._users = actions, whole, users

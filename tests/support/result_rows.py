@@ -7,8 +7,7 @@ from ucfrec.results.rows import ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
-    """A row of a recommendation table with `value` as R_cum; `metrics` are added to it, other
-    `fields` replace those of the row."""
+    """A row of a recommendation table: R_cum is `value`, beside `metrics` and other `fields`."""
     given: dict[str, Any] = {"suite": "recommendation", "table": "main", "metric": "R_cum"}
     given |= {"task": "w", "environment": "w", "method": "m", "policy": "m"}
     given |= {"training_seed": 0, "checkpoint": "best"} | fields

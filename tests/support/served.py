@@ -64,8 +64,7 @@ def learn_tastes(trained: TrainedPolicy) -> None:
 
 
 def learn_interests(trained: TrainedPolicy, until: int = 0) -> None:
-    """Give the run's reward model interests of users, known and new, as if it had been trained on
-    rows until that time."""
+    """Give the run's reward model interests of users, as if trained on rows until that time."""
     interests, random = trained.reward_model.interests, torch.Generator().manual_seed(3)
     interests.until.fill_(until)
     for values in (interests.usual, interests.sums):

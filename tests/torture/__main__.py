@@ -72,8 +72,7 @@ def main() -> int:
 
 
 def list_parts(folder: Path, cases: dict[str, float], mutated: bool, seed: int) -> Iterator[Part]:
-    """The parts of the checks in `cases`, each of which has a case at least; if `mutated`, those
-    that a mutant breaks, of some cases at least."""
+    """The parts of the checks in `cases`, of a case at least; if `mutated`, what a mutant breaks."""
     inputs = Inputs(folder)
     jobs, readers = inputs.jobs(), list_readers(inputs)
     ends = cache(partial(Ends.of, inputs, folder))

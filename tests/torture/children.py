@@ -119,8 +119,7 @@ def command(*arguments: object) -> Callable[[], int]:
 
 
 def run_first(work: Callable[[], int]) -> End:
-    """Run in a fork, after which this interpreter imports what the fork imported: later forks spend
-    their time on what the command does."""
+    """Run in a fork, then import what it imported: later forks spend their time on the command."""
     with tempfile.NamedTemporaryFile("r") as names:
 
         def listed() -> int:

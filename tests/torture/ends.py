@@ -55,8 +55,7 @@ class Ends:
         return cls(inputs, job, folder, digest_output(place / job.out), seconds, aims)
 
     def kills(self, cases: int, seed: int) -> Counter[str]:
-        """Kill the command while it writes or at a random moment, look at what is there, run it
-        again, and look again."""
+        """Kill the command while it writes or at any moment; look, run it again, look again."""
         counts = Counter[str]()
         for generator, out, number in self._places("kill", cases, seed, counts):
             work = self.inputs.work(self.job, out)

@@ -1,5 +1,4 @@
-"""Fatigue is found where users have fatigue, and only there; later steps show nothing of earlier
-ones."""
+"""Fatigue is found only where users have it; later steps show nothing of earlier ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +19,7 @@ LAGS = 10
 
 
 def sessions(factor: float, seed: int, count: int = 150, length: int = 40) -> LoggedRuns:
-    """Sessions of two tags whose users have fatigue for 4 steps after 3 likes of one tag in a
-    row."""
+    """Sessions of two tags; users have fatigue for 4 steps after 3 likes of a tag in a row."""
     rng, runs, liked = np.random.default_rng(seed), [], []
     for _ in range(count):
         tags, likes = np.zeros(0, dtype=int), np.zeros(0, dtype=bool)

@@ -352,7 +352,7 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(trained: Tra
 
 
 def listed_store(folder: Path) -> tuple[EpisodeStore, Callable[..., Array]]:
-    """Pages of four random items, worth less below one of their tag; and chances of clicks (B, 4)."""
+    """Pages of four random items, worth less below one of their tag; chances of clicks (B, 4)."""
     rng, n_items, sessions, pages = np.random.default_rng(0), 36, 600, 3
     quality, taste = rng.normal(0, 0.6, n_items), rng.normal(0, 1.2, (60, 4))
 

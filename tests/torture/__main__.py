@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def list_parts(folder: Path, cases: dict[str, float], mutated: bool, seed: int) -> Iterator[Part]:
-    """The parts of the checks in `cases`, of a case at least; if `mutated`, what a mutant breaks."""
+    """The parts of checks in `cases`, of a case at least; if `mutated`, what a mutant breaks."""
     inputs = Inputs(folder)
     jobs, readers = inputs.jobs(), list_readers(inputs)
     ends = cache(partial(Ends.of, inputs, folder))

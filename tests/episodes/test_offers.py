@@ -148,9 +148,8 @@ def test_everything_that_decides_asks_what_is_available(store: EpisodeStore, pol
         items = policy.recommend(k=42, filter_seen=False, at=time).item_id.unique()
         assert sorted(items) == [item for item in range(42) if is_available(item, time)]
     # Of all 42 items, five drawn evenly would hold every eighth one shown.
-    assert (
-        policy.rank(store.path.parent / "log.parquet", k=5).to_frame().hit_rate_shown > 0.3
-    ).all()
+    ranks = policy.rank(store.path.parent / "log.parquet", k=5).to_frame()
+    assert (ranks.hit_rate_shown > 0.3).all()
 
 
 def test_times_that_cannot_be_are_refused_or_noted(
@@ -167,9 +166,10 @@ def test_times_that_cannot_be_are_refused_or_noted(
     with pytest.warns(InputNote, match="rows show an item at a time at which"):
         prepare([log], mapping, tmp_path / "store", PrepareOptions())
     late = frame.available_until.astype("string").where(frame.item_id != 3, "31 Jan 2023")
-    write(frame.assign(available_until=late), tmp_path / "items.parquet")
-    with pytest.raises(InputError, match=r"items.parquet: available_until is no time in 1 rows"):
-        prepare([log], mapping, tmp_path / "unread", PrepareOptions())
+    for times, count in (late, 1), (frame.available_until // 1000, 41):  # seconds
+        write(frame.assign(available_until=times), tmp_path / "items.parquet")
+        with pytest.raises(InputError, match=rf"items.parquet: .* no time in {count} rows"):
+            prepare([log], mapping, tmp_path / "unread", PrepareOptions())
     write(frame.assign(born=frame.available_until), tmp_path / "items.parquet")
     with pytest.raises(InputError, match=r"items.parquet: 41 of 44 rows .* not after"):
         prepare([log], mapping, tmp_path / "other", PrepareOptions())

@@ -272,8 +272,7 @@ def _survey_ids(
 
 
 class _Shard:
-    """A shard of the old store: `lengths` (E,) of its episodes, which of them `stays` (E,), and the
-    `times` of its steps (S,)."""
+    """An old shard: `lengths` (E,) of episodes, which `stays` (E,), `times` (S,) of its steps."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.offsets = folder, np.load(folder / f"{schema.OFFSETS}.npy")
@@ -282,8 +281,7 @@ class _Shard:
         self.stays: BoolArray = np.ones(len(self.lengths), dtype=bool)
 
     def load(self, name: str, rows: BoolArray) -> Array:
-        """A column at the steps of some episodes (E,) or at some steps (S,), even if it is one of
-        episodes."""
+        """A column, also one of episodes, at the steps of some episodes (E,) or some steps (S,)."""
         values = np.load(self.folder / f"{name}.npy", mmap_mode="r")
         if len(rows) == len(self.lengths):
             rows = np.repeat(rows, self.lengths)

@@ -271,8 +271,7 @@ def _make_feedback(
 def _feedback_columns(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
 ) -> tuple[str, ...]:
-    """Columns of numbers and truth values but `keys` (in lower case), each once, with a note on
-    those that are left out."""
+    """Columns of numbers and truth values but `keys` (in lower case), once; a note on others."""
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
     not_numbers = []

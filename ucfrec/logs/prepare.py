@@ -193,8 +193,7 @@ def prepare(
 def validate(
     paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
-    """Check the logs as `prepare` does, without writing a store; returns its report, or raises its
-    InputError."""
+    """Check logs as `prepare` does, but write no store; return its report, or raise InputError."""
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
     with read_log(log_files(paths), mapping, options, spill) as log:

@@ -516,8 +516,7 @@ def hash_ids(ids: Sequence[object]) -> IntArray:
 
 
 def mix_bits(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
-    values have different results."""
+    """The finaliser of SplitMix64, which is one-to-one: each bit depends on all bits of a value."""
     values = values + np.uint64(0x9E3779B97F4A7C15)
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

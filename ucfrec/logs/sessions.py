@@ -378,8 +378,7 @@ def list_text_ids(store: Path | None) -> tuple[str, ...]:
 
 
 def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str, list[Any]]:
-    """Write `users.parquet`, `items.parquet` and when items are on offer; returns a digest of each
-    for the fingerprint."""
+    """Write `users.parquet`, `items.parquet` and what is on offer; return a digest of each."""
     digests: dict[str, list[Any]] = {}
     for name, table, file in ID_TABLES:
         if name not in log.columns:

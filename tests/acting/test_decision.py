@@ -107,8 +107,7 @@ def test_extreme_temperatures_have_their_limits(temperature: float) -> None:
 def test_only_the_best_are_drawn_from() -> None:
     rule = DecisionRule(0.0, temperature=1.0, top_k=2)
     found = rule.log_probabilities(SCORES).exp()
-    share = math.e / (1 + math.e)
-    assert found[0].tolist() == pytest.approx([0, share, 0, 1 - share])
+    assert found[0].tolist() == pytest.approx([0, math.e / (1 + math.e), 0, 1 / (1 + math.e)])
     many = replace(rule, top_k=99)
     torch.testing.assert_close(many.log_probabilities(SCORES).exp(), SCORES.softmax(1))
     few = torch.tensor([[-math.inf, 1.0, -math.inf, -math.inf]])
@@ -213,8 +212,7 @@ def test_items_that_are_never_drawn_leave_the_others_as_likely(explore: float) -
 
 
 def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:
-    scores = torch.tensor([[0.0, 40.0, 1.0]])
-    rule = DecisionRule(0.0, temperature=1.0)
+    rule, scores = DecisionRule(0.0, temperature=1.0), torch.tensor([[0.0, 40.0, 1.0]])
     items, propensities = rule.rank_items(scores, 3, torch.full((1, 4), 0.5))
     assert items.tolist() == [[1, 2, 0]]
     assert propensities[0].tolist() == pytest.approx([1, math.e / (1 + math.e), 1], rel=1e-6)

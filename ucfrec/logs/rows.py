@@ -343,9 +343,8 @@ def mark_faults(
     known_items: Path | None,
     any_held: bool = False,
 ) -> str:
-    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
-    get a hash. With `known_items`, of a store, other items are a fault; with `any_held`, rows of
-    the relation `HELD`."""
+    """SQL of typed rows with `fault`: 0, or the number of the first, from 1. Actions get a hash.
+    Items not in `known_items`, of a store, are a fault; with `any_held`, also rows of `HELD`."""
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS

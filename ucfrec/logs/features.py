@@ -88,7 +88,7 @@ def load_features(
         if count != ids:
             raise InputError(
                 f"{', '.join(map(str, table.files))}: {count - ids} of {count} rows "
-                f"repeat {table.key} with other features; keep one row per {kind}"
+                f"repeat a {table.key}; keep one row per {kind}{' or equal features' * bool(times)}"
             )
     return names
 

@@ -91,13 +91,16 @@ def test_rows_beside_their_candidates_are_noted_and_bad_columns_refused(tmp_path
     count = (~log.item_id.isin([3, 4])).sum()
     with pytest.warns(InputNote, match=rf"{count} of 400 rows show .* not among the row's"):
         prepared(outside, tmp_path / "store")
+    strange = log.assign(candidates=[["0" * (item % 2) + str(item)] for item in log.item_id])
+    with pytest.warns(InputNote, match="10 of 20 sets of candidates have no item of the store"):
+        prepared(write(strange, tmp_path / "strange.parquet"), tmp_path / "strange")
+    first, later = log.assign(candidates=[[*range(20)]] * 400), log.assign(item_id=log.item_id ^ 1)
+    with pytest.warns(InputNote, match="400 rows have other candidates than the row above in"):
+        prepared(write(pd.concat([first, later]), tmp_path / "pages.parquet"), tmp_path / "pages")
     with pytest.raises(InputError, match=r"candidates .*use a list of item_ids"):
         prepared(write(log.assign(candidates=0.5), tmp_path / "bad.parquet"), tmp_path / "bad")
     named = write(log.assign(candidates="a"), tmp_path / "named.parquet")
-    several, no_list = (
-        "candidates a names several sets",
-        r"(DOUBLE..|BIGINT); use a list of item_ids",
-    )
+    several, no_list = "candidates a names several", r"(DOUBLE..|BIGINT); use a list of item_ids"
     for items, says in (([[3, 4], [3]], several), ([[3.0]], no_list), ([3], no_list)):
         names = pd.DataFrame({"candidates": "a", "items": items})
         write(names, tmp_path / "named.candidates.parquet")

@@ -44,19 +44,15 @@ class DecisionRule:
     """
 
     target: _Return
-    """Target return in units of the training reward, of a session or of every step
-    (`ReturnToGo`)."""
+    """Target return, in units of the reward, of a session or of every step (`ReturnToGo`)."""
     minimum_target: _Return | None = None
-    """Target returns are at least this, also once a session has reached its target; None for no
-    minimum."""
+    """Least target return, also once a session has reached its target; None for no minimum."""
     reward_weight: Weight = 0.0
-    """Weight β of the reward model, whose predictions are log-odds of a reward, or rewards in
-    standard deviations; 0 for none."""
+    """Weight β of the reward model, in log-odds of a reward or standard deviations; 0 for none."""
     policy_weight: Weight = 1.0
     """w, weight of the policy; 0 for none."""
     lookahead: Annotated[float, Field(ge=0, le=1e12)] = 0.0
-    """V, expected return after the step, in reward units, of a session that it does not end; 0 for
-    none."""
+    """V, expected return after the step, in reward units, if the session goes on; 0 for none."""
     temperature: Weight = 0.0
     """T; items are drawn, or, at 0, the best is taken."""
     top_k: _Items | None = None
@@ -67,8 +63,7 @@ class DecisionRule:
     exclude_seen: bool = False
     """Whether items that the session has shown are excluded."""
     tag_window: Annotated[int, Field(ge=0, le=10**4)] = 0
-    """Items that share a tag with one of this number shown before are excluded, unless none
-    remain."""
+    """Items that share a tag with one of so many shown before are excluded, unless none remain."""
     tag_run: Annotated[int, Field(ge=0, le=WINDOW)] = 0
     """Items with the main tag of the so many shown before are excluded, if all of these had it and
     were liked, unless none remain; 0 for no such limit."""
@@ -86,8 +81,7 @@ class DecisionRule:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], source: str) -> Self:
-        """Rebuild a rule from its `as_dict`; messages name the `source`. InputError if a field is
-        unknown, missing, of another type or out of range."""
+        """Rebuild a rule from its `as_dict`; InputError, with the `source`, if a field is wrong."""
         try:
             return cls(**values)
         except (InputError, TypeError) as error:
@@ -144,8 +138,7 @@ class DecisionRule:
 
         Args:
             scores: (B, n_items) of `Scorer.scores`.
-            earlier: (B, P) int64 different items at the positions before, −1 for none; None for
-                those of a first position.
+            earlier: (B, P) int64 different items above, −1 for none; None at a first position.
             term: `Scorer.list_term`.
         """
         if term is not None and earlier is not None:
@@ -154,13 +147,13 @@ class DecisionRule:
                 turns.add(items, turns.next())
             joint = turns.joint.log_softmax(0).nan_to_num(nan=0.0, neginf=-torch.inf)
             return (joint.unsqueeze(2) + turns.next()).logsumexp(0).log_softmax(1).float()
-        modes = self._modes(scores)
         if earlier is None or not earlier.shape[1]:
+            modes = self._modes(scores)
             first, *second = (logs.add_(math.log(share)) for share, logs in modes)
             return torch.logaddexp(first, second[0]) if second else first
         positions = torch.where(earlier < 0, scores.shape[1], earlier)
         so_far, never, next_items = list[Tensor](), list[Tensor](), list[Tensor]()
-        for share, logs in self._follow_best(modes, scores):
+        for share, logs in self._list_modes(scores, positions.shape[1] + 1):
             # A further item that is never drawn stands for none.
             logs = F.pad(logs, (0, 1), value=-torch.inf)
             chances = _conditional(logs, positions).masked_fill(earlier < 0, 0.0)
@@ -175,17 +168,33 @@ class DecisionRule:
         joint = (shares + torch.stack(next_items)).logsumexp(0)
         return torch.nan_to_num(joint - joint.logsumexp(1, keepdim=True), nan=-torch.inf).float()
 
-    def _follow_best(
-        self, modes: list[tuple[float, Tensor]], scores: Tensor
-    ) -> list[tuple[float, Tensor]]:
-        """The modes in float64; once no item is left that they draw, the others follow by score."""
-        ranks = scores.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
-        last = _LAST * (1.0 + ranks.double())
-        return [(share, logs.double().maximum(last)) for share, logs in modes]
+    def log_probabilities_of(
+        self,
+        lists: Tensor,
+        scores: Tensor,
+        term: ListTerm | None,
+    ) -> Tensor:
+        """(B,) `log_probabilities` of the last items of lists (B, P) alone, which is faster."""
+        earlier, items = lists.tensor_split([-1], dim=1)
+        if self.explore or term is not None or not earlier.shape[1]:
+            return self.log_probabilities(scores, earlier, term).gather(1, items)[:, 0]
+        ((_, logs),) = self._list_modes(scores, lists.shape[1])
+        logs = F.pad(logs, (0, 1), value=-torch.inf)
+        numbers = torch.where(lists < 0, scores.shape[1], lists)
+        last = _conditional(logs, numbers)[:, -1]
+        return last.masked_fill((earlier == items).any(1), -torch.inf).float()
+
+    def _list_modes(self, scores: Tensor, length: int) -> list[tuple[float, Tensor]]:
+        """`_modes` in float64; in a list of this length, items that they never draw come last."""
+        modes = [(share, logs.double()) for share, logs in self._modes(scores)]
+        best = best_items(scores, min(length, scores.shape[1]))
+        last = _LAST * torch.arange(1, best.shape[1] + 1).double()
+        for _, logs in modes:
+            logs.scatter_(1, best, logs.gather(1, best).maximum(last))
+        return modes
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Items (B,) of scores (B, n_items), and the probabilities (B,) with which they were
-        chosen."""
+        """Items (B,) of scores (B, n_items), and the probabilities (B,) of choosing them."""
         if not self.draws:
             return _best(scores), torch.ones(len(scores))
         probabilities = self.log_probabilities(scores).exp_()
@@ -216,13 +225,8 @@ class DecisionRule:
         if not self.draws:
             return best_items(scores, k), torch.ones(len(scores), k, dtype=torch.float64)
         assert uniforms is not None
-        modes = self._modes(scores)
-        drawable = (modes[0][1] > -torch.inf).sum(1)
-        if len(modes) > 1 or int(drawable.min()) < k:
-            modes = self._follow_best(modes, scores)
-        logs = modes[0][1].double()
-        if len(modes) > 1:
-            logs = torch.where(uniforms[:, -1:] < self.explore, modes[1][1], logs)
+        modes = self._list_modes(scores, k)
+        logs = torch.where(uniforms[:, -1:] < self.explore, modes[-1][1], modes[0][1])
         # The largest sums of log-probability and Gumbel noise are draws without replacement.
         noise = uniforms[:, :-1].double().clamp(min=1e-300)
         items = (logs - torch.log(-torch.log(noise))).topk(k, dim=-1).indices

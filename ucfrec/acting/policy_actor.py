@@ -160,10 +160,7 @@ class PolicyActor:
         return self._scorer.rule.choose(scores, self._generator)
 
     def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Subtract the rewards (N,) from the returns-to-go and advance by one step.
-
-        `actions`, (N, A) or (N,), is not used: `act` has recorded them.
-        """
+        """Advance by one step with rewards (N,); `act` has recorded the actions."""
         self._sessions = self._sessions.add_step(self._actions, torch.from_numpy(rewards))
 
     def _find_excluded(self) -> Tensor | None:

@@ -115,8 +115,7 @@ class Scorer:
         self._has_two_rewards = reward_model is not None and bool(reward_model.binary)
         self._items = _ItemProduct(policy, reward_model, states)
         self.engine: Callable[[Sessions, Tensor], Tensor] | None = None
-        """Computes the scores (1, n_items) of a single session, given what may not be shown, bool
-        of that size; None for torch."""
+        """Scores (1, n_items) of one session, given what may not be shown, bool; None for torch."""
         self._require_parts()
 
     def under(self, rule: DecisionRule) -> "Scorer":

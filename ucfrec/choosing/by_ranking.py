@@ -115,7 +115,8 @@ class LoggedEvidence:
         view = view.select(np.sort(draw_episodes(view, most, [seed, 7])))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
-        self._above = torch.from_numpy(view.items_above(episodes, steps))
+        lists = [view.items_above(episodes, steps), self._logged.items[:, None]]
+        self._lists = torch.from_numpy(np.hstack(lists))
         self.propensities = read_propensities(view, episodes, steps)
         """(M,) if all steps have one."""
         self._users = np.unique(number_users(view), return_inverse=True)[1]
@@ -125,14 +126,13 @@ class LoggedEvidence:
         """The evidence of each rule."""
         shape = len(rules), len(self._logged.steps)
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
-        items = torch.from_numpy(self._logged.items).unsqueeze(1)
         terms = [self._logged.scorer.under(rule).list_term for rule in rules]
         for part, n, scores in self._logged.score(rules):
             if self.propensities is not None:
-                chances = rules[n].log_probabilities(scores, self._above[part], terms[n])
-                logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
+                chances = rules[n].log_probabilities_of(self._lists[part], scores, terms[n])
+                logs[n, part] = chances.double().numpy()
             top = best_items(scores, min(SHOWN, scores.shape[1]))
-            hits[n, part] = (top == items[part]).any(1).numpy()
+            hits[n, part] = (top == self._lists[part, -1:]).any(1).numpy()
         return [self._weigh(logs[n], hits[n]) for n in range(len(rules))]
 
     def _weigh(self, logs: Float64Array, hits: BoolArray) -> RuleEvidence:

@@ -11,7 +11,7 @@ import xxhash
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import bind, text_of_column, to_arrow, wrong_type
 from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
@@ -50,8 +50,8 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     Sets of `older`, as of `Offers.sets`, keep their numbers; others follow, ordered by their items.
 
     Returns (K + 1,) the set of each code of candidates, −1 for none and for a set without a
-    known item; and (2, C) all sets, as of `Offers.sets`. Raises InputError if a table of sets
-    cannot be used, or a row names a set that is in none.
+    known item, of which a note says how many; and (2, C) all sets, as of `Offers.sets`. Raises
+    InputError if a table of sets cannot be used, or a row names a set that is in none.
     """
     connection = log.connection
     if schema.CANDIDATES not in log.columns:
@@ -85,6 +85,13 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
             (PARTITION BY number IS NULL ORDER BY members)) AS number
         FROM new LEFT JOIN old USING (members)
     """)
+    (unknown,) = log.one(
+        f"SELECT count(*) FROM named_sets JOIN candidate_codes USING ({schema.CANDIDATES}) "
+        f"ANTI JOIN numbered_sets USING (code) WHERE len({ITEMS}) > 0"
+    )
+    if unknown:
+        which = f"{unknown:,} of {n_codes:,} sets of {schema.CANDIDATES} have no item of the store"
+        warn_user(f"{log.name}: {which} and count as all items; write ids as in item_id")
     numbers = np.full(n_codes + 1, -1)
     numbered = connection.sql("SELECT code, number FROM numbered_sets").fetchnumpy()
     numbers[numbered["code"]] = numbered["number"]

@@ -149,8 +149,7 @@ def bytes_of(size: str) -> int | None:
 
 def to_numpy(column: "pa.Array") -> Array:
     """A column of numbers or truth values without missing ones, or the values in its lists, copied
-    only if it must be; `pyarrow.Array.to_numpy` would import pandas, which takes longer than
-    reading a small log."""
+    only if it must be; `pyarrow.Array.to_numpy` would import pandas, which takes long."""
     if str(column.type).startswith("list"):
         return to_numpy(column.flatten())
     if str(column.type) == "bool":

@@ -121,8 +121,7 @@ class Expression(str):
 
 
 def computes_with_reward(expression: str) -> bool:
-    """Whether an expression is more than the column `reward` but reads it, so that rewards have to
-    be computed from a column of this name."""
+    """Whether an expression computes from the column `reward`, and is not only this column."""
     text = expression.strip().casefold()
     return text != schema.REWARD and schema.REWARD in re.findall(r"\w+", text)
 

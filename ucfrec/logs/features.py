@@ -88,7 +88,7 @@ def load_features(
         if count != ids:
             raise InputError(
                 f"{', '.join(map(str, table.files))}: {count - ids} of {count} rows "
-                f"repeat a {table.key}; keep one row per {kind}"
+                f"repeat a {table.key}; keep one row per {kind}{' or equal features' * bool(times)}"
             )
     return names
 
@@ -172,8 +172,7 @@ def _select_part(
     id_type: str,
     types: _Types,
 ) -> str:
-    """SQL of the rows of a part of a table: `id`, and of the features in `types`, to which it adds,
-    those that it has as `f0`, …."""
+    """SQL of a part's rows: `id`, and its features, which are added to `types`, as `f0`, …."""
     key = bind(connection, opened, f"key of {kind} features", table.key)
     times = _bind_times(connection, opened, table, kind)
     key_columns = {name.casefold() for bound in (key, *times.values()) for name in bound.columns}
@@ -215,9 +214,11 @@ def _select_part(
     for name, time in times.items():
         sql, _ = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)
         has_text = f"trim(CAST({time.sql} AS VARCHAR)) NOT IN ('', 'nan')"
-        if unread := _count(connection, f"{narrow.sql} WHERE {has_text} AND ({sql}) IS NULL"):
-            fault = f"{name} is no time in {unread:,} rows; write ISO 8601, or nothing for no bound"
-            raise InputError(f"{opened.files[0]}: {fault}")
+        # Seconds since 1970, read as milliseconds, are of its first weeks.
+        faulty = f"{has_text} AND ({sql}) IS NULL OR ({sql}) BETWEEN 100_000_000 AND 4_000_000_000"
+        if count := _count(connection, f"{narrow.sql} WHERE {faulty}"):
+            remedy = "write ISO 8601, or milliseconds, or nothing for no bound"
+            raise InputError(f"{opened.files[0]}: {name} is no time in {count:,} rows; {remedy}")
         values[name] = sql
     features = "".join(f", {sql} AS {name}" for name, sql in values.items())
     return f"SELECT {id_sql} AS id{features} FROM {narrow.sql}{first}"

@@ -129,8 +129,7 @@ class Histories:
 
 
 def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
-    """Of the rows of the users `numbers` (M,), user by user: the place of the user among the M, and
-    the index in `owner`, which is sorted."""
+    """Of rows of users `numbers` (M,), by user: the user's place, the index in sorted `owner`."""
     starts, ends = (np.searchsorted(owner, numbers, side=side) for side in ("left", "right"))
     lengths = ends - starts
     place = np.repeat(np.arange(len(numbers)), lengths)

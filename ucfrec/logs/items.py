@@ -70,9 +70,8 @@ def write_item_states(
     encoded: EncodedFeatures,
     size: int,
 ) -> None:
-    """Learn the item embeddings (at most `size` dimensions) and user features of the store at
-    `folder` and write them there. Where all rewards of the training split are equal, all are high.
-    """
+    """Learn and write the item embeddings (at most `size` dimensions) and user features of the
+    store at `folder`. Where all rewards of the training split are equal, all are high."""
     shards = range(StoreRecord.read(folder).n_shards)
     moments, low, highest = Moments(1), np.inf, -np.inf
     for batch in read_training_steps(folder, shards):
@@ -114,8 +113,7 @@ class Exposure:
         items: IntArray,
         weights: Float64Array,
     ) -> None:
-        """Add steps (M,); those of one user follow each other, in one call, and weights (above 0)
-        of one user and item are added up."""
+        """Add steps (M,), all of a user in a row; weights (above 0) of a user and item add up."""
         rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
         shape = (int(rows[-1]) + 1, len(self.trained))
         block = sparse.coo_matrix((weights, (rows, self._column[items])), shape=shape).tocsr()

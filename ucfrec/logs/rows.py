@@ -347,9 +347,8 @@ def mark_faults(
     known_items: Path | None,
     any_held: bool = False,
 ) -> str:
-    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
-    get a hash. With `known_items`, of a store, other items are a fault; with `any_held`, rows of
-    the relation `HELD`."""
+    """SQL of typed rows with `fault`: 0, or the number of the first, from 1. Actions get a hash.
+    Items not in `known_items`, of a store, are a fault; with `any_held`, also rows of `HELD`."""
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS
@@ -520,8 +519,7 @@ def hash_ids(ids: Sequence[object]) -> IntArray:
 
 
 def mix_bits(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
-    values have different results."""
+    """The finaliser of SplitMix64, which is one-to-one: each bit depends on all bits of a value."""
     values = values + np.uint64(0x9E3779B97F4A7C15)
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -93,8 +93,7 @@ class Episodes:
 
 
 def split_bounds(rows: SortedRows, split: tuple[float, ...]) -> tuple[int, int]:
-    """Times (ms) at which validation and test begin, of shares of the rows or of two times; beyond
-    the last row if users are split."""
+    """Times (ms) at which validation and test begin; beyond the last row if users are split."""
     if len(split) < 3:
         times = split if len(split) == 2 else (rows.last_ms + 1,) * 2
         return int(times[0]), int(times[1])
@@ -424,9 +423,9 @@ def write_steps(
 
     `fill` has the step columns of the store, with what steps without a value have; others are left
     out. None for those of the log. `sets` has the set of candidates of each code, as of
-    `number_sets`. Warns of steps whose item is not on offer, as of `offers`.
+    `number_sets`. Warns of steps whose item is not on offer, and of lists with several sets.
     """
-    unavailable = total = 0
+    unavailable = total = mixed = 0
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
     users = _read_numbers(log, "users", schema.USER_ID)
     items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
@@ -437,6 +436,8 @@ def write_steps(
             columns[schema.ITEM] = items[columns[ITEM]]
         if sets is not None:
             columns[schema.CANDIDATES] = sets[columns[CANDIDATE_SET]]
+            differs = np.diff(columns[schema.CANDIDATES], prepend=-1) != 0
+            mixed += int((differs & (columns[schema.PLACE] > 0)).sum())
         if offers is not None and count:
             chosen = columns.get(schema.CANDIDATES, np.full(count, -1))
             unavailable += offers.count_unavailable(
@@ -460,6 +461,11 @@ def write_steps(
         }
         writer.append(steps, first, {n: np.repeat(v, lengths) for n, v in values.items()})
         display.update(count)
+    if mixed:
+        warn_user(
+            f"{log.name}: {mixed:,} rows have other {schema.CANDIDATES} than the row above in "
+            "their list; give all rows of a list those that it was chosen from"
+        )
     if unavailable:
         warn_user(
             f"{log.name}: {unavailable:,} of {total:,} rows show an item at a time at which the "

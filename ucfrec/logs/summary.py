@@ -204,8 +204,7 @@ def note_dropped(
     n_read: int,
     fine: Collection[str] = ("duplicate", "left_out", "not_before"),
 ) -> None:
-    """Warn of the rows that are left out, with their numbers and reasons, unless all are `fine`;
-    `name` is that of the data, or empty."""
+    """Warn of dropped rows of data (`name`, or empty) and the reasons, unless all are `fine`."""
     counts = {reason: n for reason, n in dropped.items() if n}
     if not counts.keys() - {*fine}:
         return
@@ -301,8 +300,8 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             "finer times, or columns request_id and position",
         )
     if count := rows.repeated_positions:
-        what = "rows repeat a position of their request_id and count as another list"
-        _note(rows, f"{count:,} {what}; give every list an id of its own")
+        what = "rows repeat a position of their list and count as another one"
+        _note(rows, f"{count:,} {what}; give every list a request_id of its own")
     if report.get("items") == 1:
         _note(
             rows,

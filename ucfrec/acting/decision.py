@@ -63,7 +63,7 @@ class DecisionRule:
     exclude_seen: bool = False
     """Whether items that the session has shown are excluded."""
     tag_window: Annotated[int, Field(ge=0, le=10**4)] = 0
-    """Items that share a tag with one of so many shown before are excluded, unless none remain."""
+    """Items that share a tag with one of this many last items are excluded, unless none remain."""
     tag_run: Annotated[int, Field(ge=0, le=WINDOW)] = 0
     """Items with the main tag of the so many shown before are excluded, if all of these had it and
     were liked, unless none remain; 0 for no such limit."""

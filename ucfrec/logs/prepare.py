@@ -64,9 +64,8 @@ class PrepareOptions:
     max_session: Count | None = None
     """Episodes with more steps are dropped, as of bots; None for none."""
     split: tuple[float, ...] = (0.8, 0.1, 0.1)
-    """Shares of the rows for train, validation and test in order of time; the two times (ms) at
-    which validation and test begin; or the number of last rows of every user that test, and as many
-    before them validate."""
+    """Shares of the rows for train, validation and test in order of time; the times (ms) at which
+    validation and test begin; or how many last rows of every user test, and as many validate."""
     embedding_size: Width = 32
     """Most dimensions of an item embedding."""
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"

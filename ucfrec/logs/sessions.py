@@ -40,9 +40,8 @@ EPISODES = "episodes"
 """Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
 `begins_session` and `terminated`."""
 USED_USERS, USED_ITEMS = "used_users", "used_items"
-"""Tables of the users and items in the steps: id, `code`, `steps` and `train_count` (those of the
-training split); of users `longest`, the steps of their longest episode, and `ended`, whether their
-last one is terminated."""
+"""Tables of the users and items in the steps: id, `code`, `steps` and `train_count` (in training);
+of users `longest`, the steps of the longest episode, and `ended`, if the last is terminated."""
 ITEMS_FILE = "items.parquet"
 USERS_FILE = "users.parquet"
 EPISODE_USERS = "episode_users.parquet"
@@ -67,8 +66,7 @@ class Cut:
     max_steps: int | None = None
     """Episodes with more steps are dropped; None for none."""
     leave_last: int = 0
-    """Rows of each user, of those with more than twice as many, that test, and rows that validate;
-    0 for a split by time."""
+    """Last rows that test, and as many that validate, of users with more; 0: a split by time."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ MANY = 0.2
 """Share of the rows from which on a fault of theirs is worth a warning."""
 FEW_IDS = 20
 MOST_UNKNOWN = 0.9
-"""Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
-warning that they are unknown."""
+"""Share of unknown users or items, of `FEW_IDS` or more, from which on a warning is worth it."""
 _NAMED = 5
 """Users of the longest sessions that are named."""
 _CLOCK_HINT = (

@@ -528,8 +528,9 @@ class BoostedPolicy(ScoringPolicy):
     def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
+        count = int(self.trees)
         buffers = {name: self.get_buffer(f"tree_{name}") for name in _TABLES}
-        tables = {name: table[: int(self.trees)].cpu() for name, table in buffers.items()}
+        tables = {name: table[:count].cpu() for name, table in buffers.items()}
         trees = BoostedTrees(**tables, base=self.base.cpu())
         parts = torch.split(inputs.flatten(0, 1).cpu(), _ROWS_AT_ONCE)
         scores = torch.cat([trees(rows) for rows in parts])

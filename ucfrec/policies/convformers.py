@@ -199,7 +199,8 @@ class _LongShortBlock(nn.Module):
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         long, short = hidden.chunk(2, dim=-1)
-        both = torch.cat([self.long(long, valid), self.short(short, valid)], dim=-1)
+        convolved = self.long(long, valid), self.short(short, valid)
+        both = torch.cat(convolved, dim=-1)
         squeezed = F.relu(self.squeeze(both))
         gates = [layer(squeezed) for layer in self.gates]
         gate = torch.cat(gates, dim=-1).softmax(-1)

@@ -274,7 +274,8 @@ class ItemHead(nn.Module):
         exposed: Exposed | None,
     ) -> Tensor:
         """Logits (M,) of the logged items."""
-        product = (features * self.embed(actions)).sum(-1) / features.shape[-1] ** 0.5
+        product = (features * self.embed(actions)).sum(-1)
+        product = product / features.shape[-1] ** 0.5
         logit: Tensor = product + self._sum_bias(exposed, actions, apart=True)
         if self.exposure is not None and exposed is not None:
             return logit + self.exposure.to_items(exposed, actions.unsqueeze(1))

@@ -16,8 +16,7 @@ _ONE_OF = {
     "policies": ("policy", "builtins", "object"),
     "simulators": ("simulator", "ucfrec.evaluation.simulator", "Simulator"),
 }
-"""Of each group: its singular, for messages, and module and class of what is declared in it; the
-registry of policies checks these."""
+"""Of each group: its singular, for messages, and module and class of what is declared in it."""
 
 
 def plugin_names(group: str) -> list[str]:

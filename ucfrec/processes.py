@@ -1,5 +1,6 @@
 """The process: how it ends, with its parent too; random state; progress on stderr."""
 
+import ctypes
 import io
 import mmap
 import os
@@ -8,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
 from importlib import import_module
 from types import FrameType
@@ -28,6 +29,7 @@ _AGAIN = 0.1
 """Seconds after which an interruption that a library swallowed is raised again."""
 _BLAS = 128 * 2**20
 """Bytes that OpenBLAS asks the operating system for at its first use, and some more."""
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of malloc.h
 _LABEL: ContextVar[str] = ContextVar("label", default="")
 """Which of several jobs at the same time this is; empty for the only one."""
 _PHASE: ContextVar[str] = ContextVar("phase", default="")
@@ -140,9 +142,8 @@ def pool_of_processes(
 ) -> "Iterator[ProcessPoolExecutor]":
     """Yield a pool whose processes end when the block raises, and when this process is killed.
 
-    Work must be submitted within `block_ctrl_c`, because Ctrl-C on a terminal reaches every
-    process of a command, and this one ends the others. Each process calls `begin` first, a function
-    of a module.
+    Submit work within `block_ctrl_c`: Ctrl-C on a terminal reaches every process of a command, and
+    this one ends the others. Each process first calls `begin`, a function of a module.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
@@ -184,6 +185,13 @@ def require_blas_memory() -> None:
         mmap.mmap(-1, _BLAS).close()
     except OSError as error:
         raise MemoryError(f"no {_BLAS / 2**20:.0f} MB for linear algebra") from error
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory for new tensors, whose pages took longer to get than to use (glibc)."""
+    with suppress(AttributeError, OSError, TypeError):
+        for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_MAX, 0)):
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 @contextmanager

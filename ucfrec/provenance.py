@@ -58,8 +58,7 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_mib() -> float:
-    """Peak resident memory of this process, in MiB, since `reset_peak_memory`; on systems other
-    than Linux, since the process began."""
+    """Peak resident MiB of this process since `reset_peak_memory`; on other than Linux, ever."""
     status = Path("/proc/self/status")
     if status.exists():
         for line in status.read_text().splitlines():

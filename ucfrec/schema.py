@@ -24,8 +24,7 @@ OBSERVATION = "observation"
 """A list of floats: what was observed just before the action."""
 
 SESSION_BEGAN = "session_began"
-"""Time (ms) at which the session of the decision began: with sessions by gap, it says more than a
-pause between rows."""
+"""Time (ms) at which the session of the decision began: it says more than a pause of the rows."""
 CLOCKS_DIFFER_MS = 60_000
 """By how much the clock that said when a session began may differ from that of the rows."""
 EXCLUDES_SEEN = "excludes_seen"

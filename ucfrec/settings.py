@@ -202,8 +202,7 @@ def require_whole(
     least: int = 1,
     most: int | None = None,
 ) -> int:
-    """The whole number, NumPy's too, that `value` is; InputError if it is none, below `least` or
-    above `most`."""
+    """A whole number, also of NumPy, from `least` to `most`; InputError if `value` is none."""
     try:
         whole = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:

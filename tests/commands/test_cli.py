@@ -364,7 +364,7 @@ def test_model_card(catalog: Catalog, tmp_path: Path) -> None:
         assert main(["rank", run, logs, "--k", "5", *rule]) == 0
     found = card.read_text()
     assert "### ucfrec evaluate: synthetic-catalog, target " in found
-    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
+    assert re.search(r"### ucfrec ope: REG on sessions\.parquet, target .*temperature 1", found)
     assert "- the log cannot say: " in found
     own = TrainedPolicy.load(Path(run)).rule
     median = TrainedPolicy.load(Path(run)).target_return(0.5)

@@ -62,8 +62,7 @@ class Evaluate(SimulationOptions, RuleOptions):
     """Run folders of `ucfrec train`."""
     episodes: int = 1000
     behavior: Sequence[str] = ()
-    """Also evaluate this built-in policy of the simulator, e.g. random; repeatable (default:
-    none)"""
+    """Also evaluate this policy of the simulator, e.g. random; repeatable (default: none)"""
     json: Path | None = None
     """Also write the rows as JSON."""
 

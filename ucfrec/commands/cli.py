@@ -21,7 +21,7 @@ from ucfrec import __version__
 from ucfrec.commands.options import Table, add_options
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
 from ucfrec.files.remote import local_paths
-from ucfrec.processes import Interrupted, interruptions_raised
+from ucfrec.processes import Interrupted, interruptions_raised, keep_freed_memory
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,7 @@ class Program:
     package: str
     """Package with the modules of the commands, each a `Table` called as the command."""
     commands: Mapping[str, str]
-    """Command name to its one-line summary in `--help`, after the module and a colon if that has
-    another name."""
+    """Command name to its line in `--help`, after the module and a colon if that differs."""
     sections: Mapping[str, str] = field(default_factory=dict)
     """First command of each section of `--help` to the title of the section."""
 
@@ -71,6 +70,10 @@ UCFREC = Program(
 )
 
 
+_OF_LITTLE_MEMORY = ("Prepare", "Join", "Serve")
+"""Commands that give freed memory back, for they keep to a limit or go on for days."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one `ucfrec` command.
 
@@ -93,6 +96,8 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         with interruptions_raised(), notes_on_one_line(program.name):
             table, options = parse_command(program, arguments)
             name = f"{program.name} {table.__name__.lower()}"
+            if table.__name__ not in _OF_LITTLE_MEMORY:
+                keep_freed_memory()
             with local_paths(options) as options:
                 table(**vars(options)).execute()
             sys.stdout.flush()

@@ -1,5 +1,4 @@
-"""`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated
-environments."""
+"""`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulators."""
 
 import os
 from collections.abc import Mapping, Sequence

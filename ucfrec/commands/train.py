@@ -1,5 +1,4 @@
-"""`ucfrec train`: train a policy on an episode store; `settings` lists its settings, `tune`
-chooses them."""
+"""`ucfrec train`: train a policy on a store; `settings` lists its settings, `tune` chooses them."""
 
 import inspect
 import json

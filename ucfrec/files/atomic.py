@@ -141,8 +141,7 @@ def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None
 
 
 def remove_leftovers(folder: Path, within: bool = False) -> None:
-    """Remove the scratch and locks of processes that were killed while they wrote in `folder`,
-    and `within`, in every folder inside."""
+    """Remove what killed processes left in `folder`, and `within`, in every folder inside."""
     for file in [*folder.glob(f"{'**/' * within}.?*{LOCK}")]:
         _remove_leftover(file)
 
@@ -232,8 +231,7 @@ def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = Fa
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
-    """Write named arrays, contiguous, and metadata that JSON can represent as safetensors,
-    atomically; InputError if there is no space."""
+    """Write contiguous arrays and JSON metadata to safetensors, atomically; InputError if full."""
     from safetensors import SafetensorError  # imports NumPy
     from safetensors.numpy import save_file
 

@@ -33,8 +33,7 @@ def require_plausible_rows(path: Path, rows: int) -> None:
 
 
 def read_ids(path: Path, column: str) -> Array:
-    """The ids in a column of a Parquet file, (n,) int64 or text; InputError if it has other values,
-    lacks some, or cannot be read."""
+    """The ids in a column of a Parquet file, (n,) int64 or text; InputError if one is neither."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,9 +1,11 @@
 """Processes end with one line when interrupted, and with their parent; random states are kept."""
 
 import os
+import platform
 import pty
 import random
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -170,6 +172,22 @@ except MemoryError as error:
         pytest.skip("the address space is measured in /proc")
     end = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert end.stdout == "no 128 MB for linear algebra\n"
+
+
+REUSE = """
+import resource
+from ucfrec.processes import keep_freed_memory
+keep_freed_memory()
+for _ in range(20):
+    b"x" * 10**8
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc")
+def test_large_arrays_have_the_memory_of_earlier_ones() -> None:
+    faults = int(subprocess.check_output([sys.executable, "-c", REUSE]))
+    assert faults < 2 * 10**8 / resource.getpagesize()
 
 
 @contextmanager

@@ -84,7 +84,6 @@ def test_logged_windows_give_actions_played(environment: str, name: str, tmp_pat
     steps: list[Step] = []
     played = rollout(env, actor, EPISODES, seed=4, on_step=steps.append)
     assert played.lengths.max() > K, "some session must outgrow the context"
-
     store = written(tmp_path / "store", steps, "action" if ids is None else "item", states)
     np.testing.assert_allclose(store.returns, played.returns, rtol=1e-5)
     episodes, ends = store.all_steps()

@@ -259,7 +259,6 @@ def test_played_scored_ranked_and_recommended_alike(
         for user, items, rewards in sessions
     }
     assert max(len(found) for found in expected.values()) > trained.policy.config.context + 1
-
     # One more row for each user: the step to decide, with an arbitrary item and reward.
     latest = log.sort_values("timestamp").groupby("user_id").tail(1)
     more = latest.assign(timestamp=latest.timestamp + 1000, item_id=5, reward=1.0)
@@ -277,7 +276,6 @@ def test_played_scored_ranked_and_recommended_alike(
             ranked = ranker.scores(later.steps(rows, filter_seen=False))
             again = given.log_probabilities(ranked).exp().numpy()
             np.testing.assert_allclose(again, found, rtol=1e-3, atol=1e-6)
-
     histories = histories_of_frame(trained, log, LogMapping())
     (frame,) = recommend(trained, histories, MANY, rule=given, filter_seen=False)
     for user, found in expected.items():

@@ -148,7 +148,6 @@ def test_the_report_says_what_proposition_1_promises() -> None:
     assert report.warnings == ()
     assert sum(report.moves.histogram_counts) == report.moves.edits == len(copies.edit_step)
     assert json.loads(json.dumps(asdict(report)))["reward_model"]["latent_dim"] == 16
-
     poor = replace(crm_report, delta=dict.fromkeys(crm_report.delta, 5.0))
     _, doubted = edit_states(view(), crm, poor, generator(), ALGORITHM_5, 0)
     assert doubted.verdict.startswith("the bound means nothing")

@@ -77,7 +77,6 @@ def test_neither_shards_nor_the_size_of_appends_show(
     first[np.cumsum(lengths) - lengths] = True
     of_steps = {name: np.repeat(v, lengths) for name, v in of_episodes.items()}
     bounds = sorted({0, sum(lengths), *(min(cut, sum(lengths)) for cut in cuts)})
-
     with tempfile.TemporaryDirectory() as name:
         whole = write_store(Path(name) / "whole", episodes, some_states())
         pieces = Path(name) / "pieces"
@@ -89,7 +88,6 @@ def test_neither_shards_nor_the_size_of_appends_show(
         writer.finish(reward=schema.REWARD, source={})
         some_states().save(pieces / "item_states.safetensors")
         parts = EpisodeStore.open(pieces)
-
         cut = [np.diff(np.load(path)) for path in sorted(pieces.glob("shard-*/offsets.npy"))]
         assert np.concatenate(cut).tolist() == lengths
         # An episode that fills a shard is not torn apart.
@@ -294,7 +292,6 @@ def test_rows_before_a_step_are_those_of_the_user(seed: int, gap: int | None, sh
     earlier, later = (store_of(part, gap) for part in parts)
     rows = UserRows.of(later, later.episode_values(schema.USER), earlier)
     view = rows.continue_sessions(gap)
-
     assert view.n_steps == later.n_steps
     assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
     episodes, steps = view.all_steps()

@@ -51,7 +51,6 @@ def test_windows_equal_a_row_by_row_reading(
     with tempfile.TemporaryDirectory() as name:
         store = write_store(Path(name) / "store", episodes, states, shards)
         got = store.windows(np.array(chosen), np.array(ends), length)
-
     assert got.states.dtype == got.rewards.dtype == got.returns_to_go.dtype == torch.float32
     assert got.actions.dtype == (torch.int64 if items else torch.float32)
     for b, (number, end) in enumerate(zip(chosen, ends, strict=True)):

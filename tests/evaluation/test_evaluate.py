@@ -67,7 +67,6 @@ def test_columns_are_those_of_plain_loops() -> None:
     shown, liked = torch.tensor([5, 0, 3, 2, 9, 4]), torch.tensor([9, 0, 1, 1, 0, 1])
     numbers = np.array([1, 0, 2, 3, -1, 5])
     row = variety_columns(env, seen, TrainingCounts(shown, liked, 20), numbers)
-
     steps = np.hstack(seen)
     episodes, items = steps[:, steps[0].argsort(kind="stable")]
     tags = [set(own) or {-1} for own in TAGS_OF_ITEMS]

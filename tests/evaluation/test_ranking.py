@@ -62,7 +62,6 @@ def test_measures_are_those_of_a_slow_reader(seed: int, n: int, users: int) -> N
     top = np.argsort(-scores, axis=1, kind="stable")[:, :K]
     top[rng.random(top.shape) < 0.2] = -1  # items that are left out
     measured = measure(Period(owner, items, liked, N_ITEMS), Ranked(own, top))
-
     ranks = [[*row, item].index(item) + 1 for row, item in zip(top, items, strict=True)]
     hits = [rank <= K for rank in ranks]
     assert value(measured, "hit_rate_shown") == pytest.approx(np.mean(hits))

@@ -213,7 +213,6 @@ def test_no_way_in_lets_an_attack_through(
     monkeypatch.setenv("HOME", str(outside))
     monkeypatch.chdir(outside)
     before = snapshot(tmp_path)
-
     log, run, out = str(here / "log.parquet"), str(here / "run"), str(here / "result")
     ways = [
         ["prepare", log, "--out", out, f"--reward={text}"],

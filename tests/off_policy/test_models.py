@@ -202,7 +202,6 @@ def test_q_that_runs_away_is_stopped_and_said() -> None:
     ones = np.ones((len(features), 1), dtype=np.float32)
     logged = np.hstack([ones, 1 + features[:, [1]] ** 2])
     five = logged * np.array([1, 5], dtype=np.float32)
-
     steps = steps_of(np.abs(reward), session)
     report = fit_models(lambda: iter([(logged, five)]), steps, seed=0)[1]
     assert not report.converged

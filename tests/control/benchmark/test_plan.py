@@ -76,7 +76,6 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert of_paper.policy == rows[MAIN]["dt"].policy
     assert (of_paper.crm, of_paper.csg, of_paper.augment) == (whole.crm, whole.csg, whole.augment)
     assert replace(without, augment=whole.augment) == whole
-
     steps = {name: config.train.steps for name, config in rows[EQUAL_TIME].items()}
     assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
     assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]

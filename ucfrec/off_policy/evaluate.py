@@ -337,8 +337,8 @@ def _conclude_lists(
             if way is not chosen[0]
         )
         logs.remarks.append(
-            f"decisions are lists: rewards depend on {ASSUMPTIONS[chosen[0].positions]}; if they "
-            f"depend on {alternatives}"
+            "decisions are lists, with propensities given the items above: rewards depend on "
+            f"{ASSUMPTIONS[chosen[0].positions]}; if they depend on {alternatives}"
         )
     return chosen
 

@@ -190,7 +190,7 @@ def require_blas_memory() -> None:
 def keep_freed_memory() -> None:
     """Keep freed memory for new tensors, whose pages took longer to get than to use (glibc)."""
     with suppress(AttributeError, OSError, TypeError):
-        for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_MAX, 0)):
+        for option, value in ((_TRIM_THRESHOLD, 2**29), (_MMAP_MAX, 0)):
             ctypes.CDLL(None).mallopt(option, value)
 
 

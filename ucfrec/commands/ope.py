@@ -48,8 +48,7 @@ class Ope(RuleOptions, LogOptions):
     """Also print all estimates, and what was read."""
     discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
     lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
-    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
-    logged return"""
+    """Return per session that a launch should gain; unset, 5% of the mean logged return"""
     guardrail: Annotated[Sequence[str], _ESTIMATED, "MEASURE"] = ()
     """Least or largest change of a measure in percent, e.g. 'dwell_seconds >= -2%', an expression
     over the columns of LOGS; repeatable; a launch needs every one"""
@@ -266,22 +265,23 @@ def _describe_ranking(ranking: "Ranking") -> str:
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.reporting.tables import format_rows
 
-    columns = ranking.headings
-    rows = [{**dict.fromkeys(columns), "policy": row.method, **row.metrics} for row in ranking]
     conditions = ranking.rows[0].conditions
+    columns: Sequence[str] = ranking.headings
+    liked = f"{conditions['liked']}: {conditions['liked_share']:.1%}"
+    if conditions["liked_share"] == 1:
+        columns, liked = ("hit_rate_shown", "ndcg_shown", "coverage"), "all"
+    rows = [{**dict.fromkeys(columns), "policy": row.method, **row.metrics} for row in ranking]
     lines = [format_rows(rows, ("policy", *columns)), ""]
     lines += [f"{name:<16}{MEASURES[name]}" for name in columns if name in MEASURES]
     lines += [
-        f"{'liked':<16}{conditions['liked']}: {conditions['liked_share']:.1%} of the steps",
+        f"{'liked':<16}{liked} of the steps",
         f"k is {conditions['k']}; --json has 95% intervals and paired differences by user",
     ]
     if unseen := float(conditions["items_without_rows"] or 0):
         lines.append(f"{unseen:.1%} of the steps show an item without training rows")
     if new := float(conditions["users_without_rows"] or 0):
-        lines.append(
-            f"{new:.1%} of the steps are of users without training rows, for whom als and bpr rank "
-            "by popularity"
-        )
+        unknown = f"{new:.1%} of the steps are of users without training rows"
+        lines.append(f"{unknown}, for whom als and bpr rank by popularity")
     if lost := float(conditions["out_of_reach"] or 0):
         lines.append(
             f"{lost:.1%} of the steps show an item that the user has seen, which is excluded: "
@@ -291,8 +291,7 @@ def _describe_ranking(ranking: "Ranking") -> str:
 
 
 def _conclude_ranking(ranking: "Ranking", measured: Sequence[str]) -> str:
-    """What the rows show, in two lines: the best by liked items, and what to do next with the run
-    and the logs that were measured."""
+    """The best by liked items, and what to do next with the run and the logs `measured`."""
     rows, name = ranking.rows, "hit_rate_liked"
     if name not in rows[0].metrics:
         return "\nno step was liked; next: name what counts as liked with --liked"
@@ -300,8 +299,11 @@ def _conclude_ranking(ranking: "Ranking", measured: Sequence[str]) -> str:
     if not best.metrics[name]:
         return "\nno method lists an item that was liked; next: a larger --k, or --keep-seen"
     first = "" if best is rows[0] else f"; {rows[0].method} has {rows[0].metrics[name]:.3f}"
+    value = f"{best.metrics[name]:.3f} with {best.conditions['k']} items"
+    where, advice = " on liked items", f"ope {shlex.join(measured)}, the return per session"
+    if best.conditions["liked_share"] == 1:
+        where, advice = "", f"recommend {shlex.quote(measured[0])} LOGS --out FILE, the next items"
     return (
-        f"\n{best.method} has the highest hit rate on liked items ({best.metrics[name]:.3f} with "
-        f"{best.conditions['k']} items){first}. Logged clicks favour what was shown.\n"
-        f"next: ucfrec ope {shlex.join(measured)}, the return per session that it would bring"
+        f"\n{best.method} has the highest hit rate{where} ({value}){first}. Logged clicks favour "
+        f"what was shown.\nnext: ucfrec {advice}"
     )

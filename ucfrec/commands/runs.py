@@ -69,8 +69,7 @@ class Verify(Table):
     """`ucfrec verify`."""
 
     paths: Annotated[Sequence[Path], ARGUMENT, "PATH"]
-    """Episode stores and run folders (each file of theirs is read), or files of result rows
-    (.jsonl)"""
+    """Episode stores, run folders (all their files are read), or files of result rows (.jsonl)"""
 
     def execute(self) -> None:
         """Print one line per path, and one per file with a fault."""

@@ -135,8 +135,7 @@ class Tune(Table):
     trials: int = 30
     """Trainings that the search has at the end."""
     metric: Literal["value", "ndcg", "gauc"] = "value"
-    """What is maximised: the return of a session in the user model, or NDCG or GAUC on validation
-    rows"""
+    """What is maximised: return in the user model, or NDCG or GAUC on validation rows"""
     k: Annotated[int, POSITIVE] = 10
     """Items recommended, of --metric ndcg."""
     space: Path | None = None

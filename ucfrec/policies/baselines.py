@@ -428,7 +428,8 @@ class BoostedPolicy(ScoringPolicy):
         which were liked; sets the effects of pairs of attributes to those of all folds."""
         folds = np.arange(train.n_episodes) % _FOLDS
         parts = (train.select(folds == fold) for fold in range(_FOLDS))
-        of_folds = [torch.stack([c.shown, c.liked]) for c in map(TrainingCounts.of, parts)]
+        counts = map(TrainingCounts.of, parts)
+        of_folds = [torch.stack([part.shown, part.liked]) for part in counts]
         whole = torch.stack([self.impressions, self.liked]).cpu()
         # (2, folds, n_items).
         of_others = whole.unsqueeze(1) - torch.stack(of_folds, 1)
@@ -505,7 +506,8 @@ class BoostedPolicy(ScoringPolicy):
         context = standardise(windows.states, self.state_mean, self.state_std)
         context = context[:, -1:, self._context :]  # (B, 1, F + O)
         effects = self.effects[items]
-        pairs = effects[..., 0] + (effects[..., 1:] @ context.mT).squeeze(-1)
+        products = effects[..., 1:] @ context.mT
+        pairs = effects[..., 0] + products.squeeze(-1)
         likeness_to_liked = (cosines @ liked.unsqueeze(-1)).squeeze(-1)
         likeness = (cosines @ valid.unsqueeze(-1)).squeeze(-1)
         columns = (

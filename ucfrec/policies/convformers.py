@@ -240,7 +240,8 @@ class _DynamicConvolution(nn.Module):
         taps = self.dropout(self.taps(values)).transpose(1, 2)
         taps = taps.reshape(batch, self.groups, self.kernel, tokens)
         # A kernel's weights sum to 1 over tokens of the window only; the own token is the last.
-        visible = F.pad(valid, (self.kernel - 1, 0)).unfold(1, tokens, 1).clone()
+        present = F.pad(valid, (self.kernel - 1, 0))
+        visible = present.unfold(1, tokens, 1).clone()
         visible[:, -1] = True
         taps = taps.masked_fill(~visible.unsqueeze(1), -torch.inf).softmax(2)
         # (B, c, 5 + L) -> (B, groups, c/groups, 5 + L)

@@ -212,11 +212,13 @@ class SupervisedAttention(nn.Module):
         queries = self.query(self.norm(states)).split(width, -1)
         key_value = self.key_value(self.norm(tokens)).split(width, -1)
         keys, values = key_value[: self.heads], key_value[self.heads :]
-        scores = torch.stack([q @ k.mT for q, k in zip(queries, keys, strict=True)], 1)
+        products = [q @ k.mT for q, k in zip(queries, keys, strict=True)]
+        scores = torch.stack(products, 1)
         scores = (scores / width**0.5).masked_fill(~visible.unsqueeze(1), -torch.inf)
         attention = scores.softmax(-1)  # (B, H, Q, 3K)
         shares = self.dropout(attention).unbind(1)
-        mixed = torch.cat([share @ value for share, value in zip(shares, values, strict=True)], -1)
+        heads = [share @ value for share, value in zip(shares, values, strict=True)]
+        mixed = torch.cat(heads, -1)
         return self.out(mixed), attention
 
 

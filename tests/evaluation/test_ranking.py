@@ -253,8 +253,9 @@ def test_rank_without_the_store(store: EpisodeStore, tmp_path: Path, capsys: Cap
         assert main(["rank", run, later, "--k", "5"]) == 0
         outputs.append(capsys.readouterr().out)
         assert ("without what they were shown before" in outputs[-1]) == gone
-    kept, lost = (next(line for line in out.splitlines() if "item-knn" in line) for out in outputs)
-    assert kept != lost
+    assert len({next(x for x in out.splitlines() if "item-knn" in x) for out in outputs}) == 2
+    assert main(["rank", run, later, "--liked", "reward = reward"]) == 0
+    assert "gauc" not in capsys.readouterr().out
 
 
 SHORT = ["train.steps=20", "train.validate_every=10", "policy.dim=8", "policy.context=4"]

@@ -1,4 +1,4 @@
-"""The process: how it ends, with its parent too; random state; progress on stderr."""
+"""The process: how it ends, with its parent too; memory; random state; progress on stderr."""
 
 import ctypes
 import io

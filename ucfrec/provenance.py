@@ -58,7 +58,7 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_mib() -> float:
-    """Peak resident MiB of this process since `reset_peak_memory`; on other than Linux, ever."""
+    """Peak resident MiB since `reset_peak_memory`; on other systems than Linux, since the start."""
     status = Path("/proc/self/status")
     if status.exists():
         for line in status.read_text().splitlines():

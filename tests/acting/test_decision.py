@@ -179,7 +179,7 @@ def test_probabilities_of_a_list_are_those_with_which_it_was_drawn(
         assert not chances.gather(1, items[:, :place]).any()
         for item in range(7):  # each of them alone
             lists = torch.nn.functional.pad(earlier, (0, 1), value=item)
-            alone = rule.log_probabilities_of(lists, scores, term).double().exp()
+            alone = rule.log_probabilities_of(scores, lists, term).double().exp()
             torch.testing.assert_close(alone, chances[:, item], atol=1e-6, rtol=1e-5)
         if place < 4:
             of_items = chances.gather(1, items[:, place : place + 1])[:, 0]

@@ -48,7 +48,7 @@ class DecisionRule:
     minimum_target: _Return | None = None
     """Least target return, also once a session has reached its target; None for no minimum."""
     reward_weight: Weight = 0.0
-    """Weight β of the reward model, in log-odds of a reward or standard deviations; 0 for none."""
+    """Weight β of the reward model's log-odds of a reward, or standardised rewards; 0 for none."""
     policy_weight: Weight = 1.0
     """w, weight of the policy; 0 for none."""
     lookahead: Annotated[float, Field(ge=0, le=1e12)] = 0.0
@@ -170,8 +170,8 @@ class DecisionRule:
 
     def log_probabilities_of(
         self,
-        lists: Tensor,
         scores: Tensor,
+        lists: Tensor,
         term: ListTerm | None,
     ) -> Tensor:
         """(B,) `log_probabilities` of the last items of lists (B, P) alone, which is faster."""

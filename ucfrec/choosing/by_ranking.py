@@ -129,7 +129,7 @@ class LoggedEvidence:
         terms = [self._logged.scorer.under(rule).list_term for rule in rules]
         for part, n, scores in self._logged.score(rules):
             if self.propensities is not None:
-                chances = rules[n].log_probabilities_of(self._lists[part], scores, terms[n])
+                chances = rules[n].log_probabilities_of(scores, self._lists[part], terms[n])
                 logs[n, part] = chances.double().numpy()
             top = best_items(scores, min(SHOWN, scores.shape[1]))
             hits[n, part] = (top == self._lists[part, -1:]).any(1).numpy()

@@ -70,8 +70,8 @@ UCFREC = Program(
 )
 
 
-_OF_LITTLE_MEMORY = ("Prepare", "Join", "Serve")
-"""Commands that give freed memory back, for they keep to a limit or go on for days."""
+_FREE_MEMORY = ("Prepare", "Join", "Serve")
+"""Commands that return freed memory, because they keep to a limit or run for days."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,7 +96,7 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         with interruptions_raised(), notes_on_one_line(program.name):
             table, options = parse_command(program, arguments)
             name = f"{program.name} {table.__name__.lower()}"
-            if table.__name__ not in _OF_LITTLE_MEMORY:
+            if table.__name__ not in _FREE_MEMORY:
                 keep_freed_memory()
             with local_paths(options) as options:
                 table(**vars(options)).execute()

@@ -245,7 +245,7 @@ def explain_errors(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path | None = None
 ) -> Iterator[None]:
     """Turn errors of files, memory and disks in the block into `InputError`: the limit or a disk is
-    exhausted, or a file or value cannot be read. `folder` is written to; None: the engine's own."""
+    exhausted, or a file or value cannot be read. A full disk is that of the engine or `folder`."""
     try:
         yield
     except (OSError, SafetensorError, duckdb.Error) as error:

@@ -96,7 +96,7 @@ class LogMapping:
     earliest: str | None = None
     """ISO time (UTC) before which times are clock errors; None for 2000."""
     before_ms: int | None = None
-    """Time of requests, ms: later rows are no history; None for any. Mapping files lack it."""
+    """Time of requests, ms: later rows are no history; None for any. No mapping file has it."""
     where: str | None = None
     """SQL condition over the files' columns; rows that do not fulfil it are excluded."""
     partitions: bool = False

@@ -22,10 +22,10 @@ from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
 MANY = 0.2
-"""Share of the rows from which on a fault of theirs is worth a warning."""
+"""Share of faulty rows above which there is a warning."""
 FEW_IDS = 20
 MOST_UNKNOWN = 0.9
-"""Share of unknown users or items, of `FEW_IDS` or more, from which on a warning is worth it."""
+"""Share of unknown users or items, of `FEW_IDS` or more, from which on there is a warning."""
 _NAMED = 5
 """Users of the longest sessions that are named."""
 _CLOCK_HINT = (

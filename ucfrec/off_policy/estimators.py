@@ -138,7 +138,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         terms["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
         terms["SNDR"] = Terms(normalise_by_step(steps, left, v), ones, last)
         plain, control = terms["SNPDIS"].above, terms["SNDR"].above - terms["SNPDIS"].above
-        coefficient = fit_coefficient(plain - steps.returns, control, steps.users)
+        coefficient = _fit_coefficient(plain - steps.returns, control, steps.users)
         terms["REG"] = Terms(plain + coefficient * control, ones, last)
     if steps.place is not None:
         return terms
@@ -147,7 +147,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     return terms
 
 
-def fit_coefficient(lift: Float64Array, control: Float64Array, user: IntArray) -> float:
+def _fit_coefficient(lift: Float64Array, control: Float64Array, user: IntArray) -> float:
     """λ in [0, 1] for which the mean of lift + λ control, (S,) each, has the least variance over
     users (S,): 0 for the behavior policy itself, where the control is mere noise of a model."""
     lifts, controls = (np.bincount(user, values - values.mean()) for values in (lift, control))

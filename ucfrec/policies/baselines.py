@@ -429,7 +429,7 @@ class BoostedPolicy(ScoringPolicy):
         folds = np.arange(train.n_episodes) % _FOLDS
         parts = (train.select(folds == fold) for fold in range(_FOLDS))
         counts = map(TrainingCounts.of, parts)
-        of_folds = [torch.stack([part.shown, part.liked]) for part in counts]
+        of_folds = [torch.stack([fold.shown, fold.liked]) for fold in counts]
         whole = torch.stack([self.impressions, self.liked]).cpu()
         # (2, folds, n_items).
         of_others = whole.unsqueeze(1) - torch.stack(of_folds, 1)

@@ -1,6 +1,5 @@
 """`ucfrec-control train`: train a policy on a store; resumes."""
 
-import warnings
 from typing import Annotated, Literal
 
 import torch
@@ -8,7 +7,7 @@ import torch
 from ucfrec.commands.options import POSITIVE, Names
 from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.fitting.loop import SILENT
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.environments.environments import environment_of_data, make_env
@@ -49,7 +48,7 @@ class Train(TrainingOptions):
         steps, warmup = config.train.steps, config.train.warmup
         if warmup >= steps:
             note = f"the learning rate rises to the end: train.warmup_steps is {warmup}, of {steps}"
-            warnings.warn(f"{note} train.steps; set fewer, such as {steps // 20}", InputNote, 2)
+            warn_user(f"{note} train.steps; set fewer, such as {steps // 20}")
         callbacks = SILENT
         if self.select_by_return is not None:
             env_id = self.env or environment_of_data(dataset_of(store))

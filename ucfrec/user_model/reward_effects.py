@@ -52,6 +52,8 @@ _SHARED = ("exposure", "running", "state", "position", "above", "interest")
 """Effects of numbers of a row, whatever its item."""
 _ROWS = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
+_BLOCK = 2**14
+"""Rows of which there are copies in float64 at once."""
 
 Effects = dict[str, Tensor]
 _Map = Callable[[Tensor], Tensor]
@@ -357,13 +359,17 @@ def _scale(
 
 
 def _moments(design: Design, inputs: Tensor) -> Tensor:
-    return inputs.T @ (design.weights.unsqueeze(1) * inputs)
+    """Weighted second moments, float64: ages and rates of items differ by orders of magnitude."""
+    moments = torch.zeros((inputs.shape[1],) * 2, dtype=torch.float64)
+    for part, weights in zip(inputs.split(_BLOCK), design.weights.split(_BLOCK), strict=True):
+        moments += part.T.double() @ (weights.unsqueeze(1) * part).double()
+    return moments
 
 
 def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
     """U and its inverse with UᵀU = moments + ridge · I, for square matrices."""
     identity = torch.eye(len(moments), dtype=torch.float64)
-    upper = torch.linalg.cholesky(moments.double() + (ridge + _SMALLEST) * identity).T
+    upper = torch.linalg.cholesky(moments + (ridge + _SMALLEST) * identity).T
     return upper.float(), torch.linalg.solve_triangular(upper, identity, upper=True).float()
 
 

@@ -22,6 +22,7 @@ from tests.support.served import (
     as_frame,
     histories,
     observed_log,
+    request_of,
     requests_of,
     responder,
     trained_run,
@@ -138,14 +139,19 @@ def test_candidates_are_a_set_of_ids(trained: TrainedPolicy, ids: list[int | str
 
 
 def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
-    log, by = histories(users=6), responder(trained, k=24)
-    asked = [{**each, "new_session": n % 2 == 0} for n, each in enumerate(requests_of(log))]
-    goes_on, begins = (recommended(trained, log, 24, new_session=new) for new in (False, True))
-    for request, found in zip(asked, by.answers([Request(**r) for r in asked]), strict=True):
-        same, other = (begins, goes_on) if request["new_session"] else (goes_on, begins)
-        scores = [f[f.user_id == request["user_id"]].score.to_numpy() for f in (same, other)]
-        np.testing.assert_allclose(found.scores, scores[0], rtol=1e-5, atol=1e-6)
-        assert not np.allclose(*scores, rtol=1e-3)
+    """As the request says, or else after a pause longer than the run's gap."""
+    log, by = histories(users=8), responder(trained, k=24)
+    for n, (_, rows) in enumerate(log.groupby("user_id")):
+        new, stated = bool(n % 2), None if n % 4 > 1 else bool(n % 2)
+        late = new if stated is None else not new
+        age = (trained.record.session_gap_ms or 0) + (60_000 if late else -60_000)
+        now = 1000 * round(time.time())
+        rows = rows.assign(timestamp=rows.timestamp - rows.timestamp.max() + now - age)
+        (answer,) = by.answers([Request(**request_of(rows, new_session=stated))])
+        same, other = (recommended(trained, rows, 24, new_session=b).score for b in (new, not new))
+        np.testing.assert_allclose(answer.scores, same, rtol=1e-5, atol=1e-6)
+        assert not np.allclose(same, other, rtol=1e-3)
+    assert by.drift()["new_sessions"].value == 0.5
 
 
 def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: TrainedPolicy) -> None:

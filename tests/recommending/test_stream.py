@@ -106,13 +106,14 @@ def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolic
         {"user_id": one["user_id"], "interactions": rows[3:]},
         {"user_id": two["user_id"]},
     ]
+    parts = [part | {"new_session": False} for part in parts]
     found = streamed(trained, lines(parts))
     assert "error" in found[1]
     expected = streamed(trained, lines([two, one, two]))
     pd.testing.assert_frame_equal(shown(found[2:]), shown(expected), rtol=1e-5)
     # Users beyond the limit are forgotten, the longest unheard of first.
     forgot = streamed(trained, lines(parts), remember=len(two["history"]))
-    alone = streamed(trained, lines([{"user_id": one["user_id"], "history": rows[3:]}]))
+    alone = streamed(trained, lines([one | {"history": rows[3:]}]))
     pd.testing.assert_frame_equal(shown(forgot[3:4]), shown(alone), rtol=1e-5)
 
 

@@ -110,7 +110,7 @@ def request_of(rows: pd.DataFrame, **more: Any) -> dict[str, Any]:
     columns = [name for name in rows.columns if name != "user_id"]
     history = json.loads(rows[columns].to_json(orient="records"))
     # The id that `recommend` gives to the request of such a history.
-    request = {"request_id": f"0-{rows.timestamp.max()}"} | more
+    request = {"request_id": f"0-{rows.timestamp.max()}", "new_session": False} | more
     return {"user_id": int(rows.user_id.iloc[0]), "history": history, **request}
 
 

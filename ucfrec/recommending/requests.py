@@ -125,8 +125,9 @@ class Request(BaseModel):
     # Not `Id`, as checking the range of every one takes as long as reading it.
     candidates: Annotated[list[int | str], Field(min_length=1, fail_fast=True)] | None = None
     """The only items to recommend."""
-    new_session: bool = False
-    """Whether the user begins a new session. Otherwise the latest one of the history goes on."""
+    new_session: bool | None = None
+    """Whether the user begins a new session, or the latest one of the history goes on. Without it,
+    a pause since then that is longer than the run's gap ends that one."""
     request_id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     """Identifies the request: a repetition gets the same items. Without one, the server makes one.
     """

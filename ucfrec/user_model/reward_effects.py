@@ -52,8 +52,6 @@ _SHARED = ("exposure", "running", "state", "position", "above", "interest")
 """Effects of numbers of a row, whatever its item."""
 _ROWS = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
-_BLOCK = 2**14
-"""Rows of which there are copies in float64 at once."""
 
 Effects = dict[str, Tensor]
 _Map = Callable[[Tensor], Tensor]
@@ -361,8 +359,9 @@ def _scale(
 def _moments(design: Design, inputs: Tensor) -> Tensor:
     """Weighted second moments, float64: ages and rates of items differ by orders of magnitude."""
     moments = torch.zeros((inputs.shape[1],) * 2, dtype=torch.float64)
-    for part, weights in zip(inputs.split(_BLOCK), design.weights.split(_BLOCK), strict=True):
-        moments += part.T.double() @ (weights.unsqueeze(1) * part).double()
+    for rows in torch.split(torch.arange(len(inputs)), 2**14):
+        part, weights = inputs[rows].double(), design.weights[rows]
+        moments += part.T @ (weights.unsqueeze(1) * part)
     return moments
 
 

@@ -22,6 +22,7 @@ from tests.support.served import (
     as_frame,
     histories,
     observed_log,
+    recommend,
     request_of,
     requests_of,
     responder,
@@ -35,7 +36,6 @@ from ucfrec.logs.histories import frame_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending import recommend as module
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.requests import HistoryReader, Request, Row, RowRewards
 from ucfrec.recommending.responder import Answer, Responder, Served, arm_of, parse_split
 from ucfrec.runs.promoted import POINTER, promote, promote_back

@@ -18,6 +18,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.windows import Shown
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.recommending.recommend import decide
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -103,6 +104,11 @@ def histories(users: int = 12) -> pd.DataFrame:
     repeated = log.sample(40, random_state=0)
     again = repeated.assign(reward=1 - repeated.reward)
     return pd.concat([log, again]).sample(frac=1, random_state=1).reset_index(drop=True)
+
+
+def recommend(*inputs: Any, **how: Any) -> list[pd.DataFrame]:
+    """The frames of `decide`."""
+    return [frame for frame, _ in decide(*inputs, **how)]
 
 
 def request_of(rows: pd.DataFrame, **more: Any) -> dict[str, Any]:

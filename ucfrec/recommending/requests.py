@@ -54,8 +54,7 @@ _ROWS = "history"
 """Name of the rows in messages and in the engine."""
 _MEMORY = "512MB"
 """Half of it is the engine's: a request has some megabytes, and no expression needs much more."""
-
-
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 TIME_FORMS = "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
 
 
@@ -70,9 +69,6 @@ def parse_time(value: float | str) -> float:
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
     except (ValueError, OverflowError):
         raise ValueError(TIME_FORMS) from None
-
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @settings_table("")

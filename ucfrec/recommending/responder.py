@@ -104,7 +104,9 @@ class _Question(NamedTuple):
     def begins_session(self, ended_ms: float) -> bool:
         """Whether the request says so or, if it does not say, its last row is before a time."""
         stated = self.request.new_session
-        return self.history.timestamps.max(initial=0) < ended_ms if stated is None else stated
+        if stated is None:
+            return bool(self.history.timestamps.max(initial=0) < ended_ms)
+        return stated
 
 
 class Responder:
@@ -352,8 +354,8 @@ class Served:
         if current == self._known:
             return
         self._known, (pointer, _) = current, current
-        same_run = pointer.fingerprint in ("", self.trained.fingerprint)
-        if pointer.current == self._arms[0].name and same_run:
+        answering = self._arms[0].name, self.trained.fingerprint
+        if (pointer.current, pointer.fingerprint) == answering:
             self._refused = None
         else:
             self._replace(pointer)
@@ -380,7 +382,6 @@ class Served:
                 f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
                 "or ucfrec promote one"
             )
-        pointer.run(self._folder)
         return pointer, (self._folder / POINTER).stat().st_mtime_ns
 
     def _run(self, seconds: float) -> None:

@@ -115,11 +115,8 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
 def test_candidates_of_a_large_catalogue_are_scored_without_the_others(
     trained: TrainedPolicy, rule: DecisionRule | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rng, by, asked = (
-        np.random.default_rng(0),
-        responder(trained, rule=rule),
-        requests_of(histories()),
-    )
+    rng, by = np.random.default_rng(0), responder(trained, rule=rule)
+    asked = requests_of(histories())
     for number, request in enumerate(asked):
         some = rng.integers(24, size=1 + number % 16).tolist()
         request |= {"request_id": str(number), "candidates": some if number % 4 else None}
@@ -139,14 +136,13 @@ def test_candidates_are_a_set_of_ids(trained: TrainedPolicy, ids: list[int | str
 
 
 def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
-    """As the request says, or else after a pause longer than the run's gap."""
+    """As the request says, or else after a pause longer than the run's two hours."""
     log, by = histories(users=8), responder(trained, k=24)
     for n, (_, rows) in enumerate(log.groupby("user_id")):
         new, stated = bool(n % 2), None if n % 4 > 1 else bool(n % 2)
         late = new if stated is None else not new
-        age = (trained.record.session_gap_ms or 0) + (60_000 if late else -60_000)
-        now = 1000 * round(time.time())
-        rows = rows.assign(timestamp=rows.timestamp - rows.timestamp.max() + now - age)
+        last = 1000 * round(time.time()) - 120 * 60_000 - (60_000 if late else -60_000)
+        rows = rows.assign(timestamp=rows.timestamp - rows.timestamp.max() + last)
         (answer,) = by.answers([Request(**request_of(rows, new_session=stated))])
         same, other = (recommended(trained, rows, 24, new_session=b).score for b in (new, not new))
         np.testing.assert_allclose(answer.scores, same, rtol=1e-5, atol=1e-6)
@@ -185,9 +181,9 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
     ]
     mixed = [wrong[0][0], requests[0], *(each for each, _ in wrong[1:]), requests[1]]
     answers = responder(trained).answers([Request.model_validate(r) for r in mixed])
-    one, two = (answer for answer in answers if isinstance(answer, Answer))
+    scores = [score for answer in answers if isinstance(answer, Answer) for score in answer.scores]
     expected = answered(responder(trained), requests[:2]).score
-    np.testing.assert_allclose([*one.scores, *two.scores], expected, rtol=1e-5)
+    np.testing.assert_allclose(scores, expected, rtol=1e-5)
     errors = [answer for answer in answers if isinstance(answer, InputError)]
     for error, (_, message) in zip(errors, wrong, strict=True):
         with pytest.raises(InputError, match=message):

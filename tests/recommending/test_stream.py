@@ -75,11 +75,8 @@ def test_a_bad_line_has_one_error_and_the_stream_goes_on(trained: TrainedPolicy)
     deep, good = b'{"user_id": ' + b"[" * 100_000 + b"}", b'{"user_id": 1}'
     bad = [b"", b"{", b'{"user_id": "\xff"}', deep, b"\t\r"]
     answers = streamed(trained, b"\n".join(each for line in bad for each in (line, good)) + b"\n")
-    said = ["the request is not JSON"] * 5
-    for number, (message, wrong, right) in enumerate(
-        zip(said, answers[::2], answers[1::2], strict=True)
-    ):
-        assert message in wrong["error"]
+    for number, (wrong, right) in enumerate(zip(answers[::2], answers[1::2], strict=True)):
+        assert "the request is not JSON" in wrong["error"]
         assert "\n" not in wrong["error"]
         assert wrong["line"] == 2 * number + 1
         assert len(right["items"]) == 10

@@ -194,7 +194,8 @@ class Chooser:
 
     def request_times(self, count: int) -> Tensor:
         """(count,) int64 ms, all the same."""
-        return torch.full((count,), round(time.time() * 1000) if self.at_ms is None else self.at_ms)
+        at_ms = 1000 * time.time() if self.at_ms is None else self.at_ms
+        return torch.full((count,), round(at_ms))
 
     def choose(
         self,

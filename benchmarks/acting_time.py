@@ -72,7 +72,7 @@ def make_request(items: Array, rng: np.random.Generator, user: int) -> dict[str,
         {"item_id": item, "timestamp": BEGIN + 1000 * n, "reward": n % 2, "session_id": 1}
         for n, item in enumerate(rng.choice(items, size=HISTORY).tolist())
     ]
-    return {"user_id": f"user {user}", "history": history}
+    return {"user_id": f"user {user}", "history": history, "new_session": False}
 
 
 def draw_candidates(items: Array, rng: np.random.Generator, number: int) -> dict[str, Any]:

@@ -56,7 +56,8 @@ def request(trained: TrainedPolicy, rows: int) -> bytes:
             row["session_id"] = 1
         if size:
             row["observation"] = [0.0] * size
-    return json.dumps({"user_id": "load", "history": history, "k": 10}).encode()
+    request = {"user_id": "load", "history": history, "new_session": False, "k": 10}
+    return json.dumps(request).encode()
 
 
 @contextmanager

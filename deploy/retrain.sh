@@ -11,6 +11,8 @@ clicks=("clicks/$day.parquet")
 next="clicks/$(date -u -d "$day + 1 day" +%F).parquet"
 [ -e "$next" ] && clicks+=("$next")
 ucfrec join "$shown" "${clicks[@]}" --within 30m --out "logs/$day.parquet"
-ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --out "$new"
+# After a refusal there are the logs of several days.
+mapfile -t logs < <(find logs -name '????-??-??.parquet' -newer runs/promoted.json | sort)
+ucfrec update runs "${logs[@]}" --mapping shop.toml --window 60d --out "$new"
 ucfrec report "$new" --out "$new.html"
 ucfrec promote "$new"

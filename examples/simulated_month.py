@@ -208,6 +208,7 @@ class Serve(Show):
                 user_id=int(user),
                 history=self._history.get(int(user), []),
                 k=1,
+                new_session=False,  # the server's clock is another one
                 request_id=f"{at}-{user}",
             )
             for user, at in zip(users, now, strict=True)

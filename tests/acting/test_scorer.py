@@ -22,7 +22,7 @@ from tests.policies.test_ucf import (
     sessions_of,
 )
 from tests.support.replay import replayed
-from tests.support.served import boredom, learn_interests
+from tests.support.served import boredom, learn_interests, recommend
 from tests.support.tagged import ITEMS as MANY
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
@@ -39,7 +39,6 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.policies.baselines import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward import LAGS, ItemRewardModel

@@ -54,11 +54,8 @@ def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
     assert isinstance(policy.head, ItemHead)
     with torch.no_grad():
         policy.head.bias.copy_(torch.zeros(24).index_fill(0, liked, liked_bias))
-    config = RuleConfig(reward_weights=weights)
-    scorer, users = (
-        replace(trained, policy=policy).scorer(),
-        UserModel.fit(*views, folder / "um", 0),
-    )
+    scorer, config = replace(trained, policy=policy).scorer(), RuleConfig(reward_weights=weights)
+    users = UserModel.fit(*views, folder / "um", 0)
     return choose_by_ranking(Problem(scorer, users, {}, *views, config, 0))
 
 

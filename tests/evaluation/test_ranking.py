@@ -16,6 +16,7 @@ from torch import Tensor
 
 from tests.recommending.test_recommend import SETTINGS, random_log
 from tests.support.logs import store_of
+from tests.support.served import recommend
 from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.states import TrainingCounts
@@ -40,7 +41,6 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import read_logged_sessions
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.results.rows import read_results
 
 Capsys = pytest.CaptureFixture[str]

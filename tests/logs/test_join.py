@@ -84,12 +84,13 @@ def test_feedback_belongs_to_the_latest_exposure_within_the_window(tmp_path: Pat
     assert log.feedback.tolist() == [0, 0, 2, 0]
 
 
+EARLY = str(START + 5 * MINUTE - 50_000)
 SHOWN = {"position": [1, 2, 1, 1], "propensity": [0.5, 0.25, 0.4, 0.1]}
 COLUMNS: dict[str, tuple[tuple[str | pd.DataFrame, ...], tuple[str, ...], dict[str, Any]]] = {
     "a request id decides": (
-        (feedback([(1, 10, 7, 1, "a"), (1, 10, 7, 1, None), (2, 10, 7, 1, "z")], "request_id"),),
+        (csv("request_id,click", "a,1", ",1", "z,1"), csv("request_id,click", "b,1", time=EARLY)),
         ("click",),
-        {"feedback": [1, 0, 1, 0]},
+        {"feedback": [1, 0, 2, 0]},
     ),
     "some columns of exposures": (
         (feedback([(1, 10, 7, 1, 9, 0.9)], "position", "propensity"),),

@@ -14,6 +14,7 @@ import torch
 
 from tests.off_policy.conftest import Read
 from tests.support.replay import replayed
+from tests.support.served import recommend
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
@@ -29,7 +30,6 @@ from ucfrec.off_policy.score import (
     share_seen,
 )
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 

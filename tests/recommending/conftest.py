@@ -17,10 +17,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
 @pytest.fixture(scope="module")
 def observing(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     """A run that sees the two logged columns of observations."""
-    folder, options = (
-        tmp_path_factory.mktemp("observing"),
-        {"gap_minutes": 120, "embedding_size": 6},
-    )
+    folder = tmp_path_factory.mktemp("observing")
+    options = {"gap_minutes": 120, "embedding_size": 6}
     store = store_of(observed_log(), folder, OBSERVED, reward="reward", session_by="gap", **options)
     train_run(store, folder / "run", resolve_config("dt", None, SETTINGS))
     return TrainedPolicy.load(folder / "run")

@@ -139,6 +139,8 @@ def test_weights_of_a_policys_own_log_are_1_given_the_candidates(
     clicks.to_parquet(tmp_path / "clicks.parquet")
     join_feedback([shown], [tmp_path / "clicks.parquet"], joined, 1)
     assert len(pd.read_parquet(tmp_path / "log.candidates.parquet")) == 1 + served
+    first = pd.to_datetime(rows.timestamp.iloc[0], unit="ms")
+    assert not served or [*shown.glob(f"exposures-{first:%Y%m%dT%H%M%S}-*")]
     policy = Recommender.load(trained.folder)
     scores = policy.score(joined, rule=rule)
     assert scores.user_id.nunique() == len(scores) == 30

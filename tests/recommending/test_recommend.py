@@ -220,6 +220,8 @@ def test_unknown_items_are_refused_or_skipped(policy: Recommender, log: pd.DataF
     )
     newcomer = log.tail(1).assign(user_id=777, item_id=999)
     assert len(policy.recommend(newcomer, k=4, skip_unknown=True)) == 4
+    with pytest.warns(InputNote, match="40 of 40 users are not among those the run was trained on"):
+        policy.recommend(log.assign(user_id=log.user_id + 1000))
 
 
 def test_the_reward_is_the_runs_expression_or_a_column(log: pd.DataFrame) -> None:

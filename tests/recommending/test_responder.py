@@ -22,6 +22,8 @@ from tests.support.served import (
     as_frame,
     histories,
     observed_log,
+    recommend,
+    request_of,
     requests_of,
     responder,
     trained_run,
@@ -34,7 +36,6 @@ from ucfrec.logs.histories import frame_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending import recommend as module
 from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.requests import HistoryReader, Request, Row, RowRewards
 from ucfrec.recommending.responder import Answer, Responder, Served, arm_of, parse_split
 from ucfrec.runs.promoted import POINTER, promote, promote_back
@@ -114,11 +115,8 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
 def test_candidates_of_a_large_catalogue_are_scored_without_the_others(
     trained: TrainedPolicy, rule: DecisionRule | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rng, by, asked = (
-        np.random.default_rng(0),
-        responder(trained, rule=rule),
-        requests_of(histories()),
-    )
+    rng, by = np.random.default_rng(0), responder(trained, rule=rule)
+    asked = requests_of(histories())
     for number, request in enumerate(asked):
         some = rng.integers(24, size=1 + number % 16).tolist()
         request |= {"request_id": str(number), "candidates": some if number % 4 else None}
@@ -138,14 +136,18 @@ def test_candidates_are_a_set_of_ids(trained: TrainedPolicy, ids: list[int | str
 
 
 def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
-    log, by = histories(users=6), responder(trained, k=24)
-    asked = [{**each, "new_session": n % 2 == 0} for n, each in enumerate(requests_of(log))]
-    goes_on, begins = (recommended(trained, log, 24, new_session=new) for new in (False, True))
-    for request, found in zip(asked, by.answers([Request(**r) for r in asked]), strict=True):
-        same, other = (begins, goes_on) if request["new_session"] else (goes_on, begins)
-        scores = [f[f.user_id == request["user_id"]].score.to_numpy() for f in (same, other)]
-        np.testing.assert_allclose(found.scores, scores[0], rtol=1e-5, atol=1e-6)
-        assert not np.allclose(*scores, rtol=1e-3)
+    """As the request says, or else after a pause longer than the run's two hours."""
+    log, by = histories(users=8), responder(trained, k=24)
+    for n, (_, rows) in enumerate(log.groupby("user_id")):
+        new, stated = bool(n % 2), None if n % 4 > 1 else bool(n % 2)
+        late = new if stated is None else not new
+        last = 1000 * round(time.time()) - 120 * 60_000 - (60_000 if late else -60_000)
+        rows = rows.assign(timestamp=rows.timestamp - rows.timestamp.max() + last)
+        (answer,) = by.answers([Request(**request_of(rows, new_session=stated))])
+        same, other = (recommended(trained, rows, 24, new_session=b).score for b in (new, not new))
+        np.testing.assert_allclose(answer.scores, same, rtol=1e-5, atol=1e-6)
+        assert not np.allclose(same, other, rtol=1e-3)
+    assert by.drift()["new_sessions"].value == 0.5
 
 
 def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: TrainedPolicy) -> None:
@@ -179,9 +181,9 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
     ]
     mixed = [wrong[0][0], requests[0], *(each for each, _ in wrong[1:]), requests[1]]
     answers = responder(trained).answers([Request.model_validate(r) for r in mixed])
-    one, two = (answer for answer in answers if isinstance(answer, Answer))
+    scores = [score for answer in answers if isinstance(answer, Answer) for score in answer.scores]
     expected = answered(responder(trained), requests[:2]).score
-    np.testing.assert_allclose([*one.scores, *two.scores], expected, rtol=1e-5)
+    np.testing.assert_allclose(scores, expected, rtol=1e-5)
     errors = [answer for answer in answers if isinstance(answer, InputError)]
     for error, (_, message) in zip(errors, wrong, strict=True):
         with pytest.raises(InputError, match=message):

@@ -72,11 +72,9 @@ def test_two_runs_share_the_users_and_hup_writes_the_exposures_of_every_answer(
     shown = pd.concat(map(pd.read_parquet, folder.iterdir()))
     names = ["user_id", "arm", "request_id", "position", "item_id", "propensity"]
     expected = [
-        (str(answer["user_id"]), answer["arm"], answer["request_id"], position, *item)
-        for answer in answers
-        for position, item in enumerate(
-            ((each["item_id"], each["propensity"]) for each in answer["items"]), 1
-        )
+        (str(a["user_id"]), a["arm"], a["request_id"], position, i["item_id"], i["propensity"])
+        for a in answers
+        for position, i in enumerate(a["items"], 1)
     ]
     assert sorted(shown[names].itertuples(index=False, name=None)) == sorted(expected)
 

@@ -92,13 +92,12 @@ WRONG: dict[str, tuple[bytes, int, str]] = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_bad_request_has_one_error(trained: TrainedPolicy, case: str) -> None:
     body, status, message = WRONG[case]
-    limits = Limits(bytes=1000, k=5)
 
     async def chunks() -> AsyncIterator[bytes]:
         yield body
 
     async def ask() -> list[Any]:
-        async with client(responder(trained, limits=limits, k=5)) as http:
+        async with client(responder(trained, limits=Limits(bytes=1000, k=5), k=5)) as http:
             # With and without its length stated.
             given = (body, chunks(), b'{"user_id": 1}')
             return [await http.post("/recommendations", content=each) for each in given]
@@ -141,7 +140,6 @@ def test_a_defect_is_told_without_its_details(
     trained: TrainedPolicy, capsys: pytest.CaptureFixture[str]
 ) -> None:
     by = responder(trained)
-
     by.answers = Mock(side_effect=MemoryError("of 3 GiB"))  # type: ignore[method-assign]
 
     async def ask() -> Any:
@@ -185,8 +183,7 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     assert health.json()["rule_hash"] == trained.rule.hash
     body = described.json()["paths"]["/recommendations"]["post"]["requestBody"]
     properties = body["content"]["application/json"]["schema"]["properties"]
-    expected = {"user_id", "history", "k", "candidates", "new_session", "request_id"}
-    assert properties.keys() == expected
+    assert {*properties} == {"user_id", "history", "k", "candidates", "new_session", "request_id"}
     assert "timestamp" in properties["history"]["items"]["required"]
     assert page.status_code == 200
     assert "https://" not in page.text

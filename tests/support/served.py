@@ -18,6 +18,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.windows import Shown
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.recommending.recommend import decide
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -105,12 +106,17 @@ def histories(users: int = 12) -> pd.DataFrame:
     return pd.concat([log, again]).sample(frac=1, random_state=1).reset_index(drop=True)
 
 
+def recommend(*inputs: Any, **how: Any) -> list[pd.DataFrame]:
+    """The frames of `decide`."""
+    return [frame for frame, _ in decide(*inputs, **how)]
+
+
 def request_of(rows: pd.DataFrame, **more: Any) -> dict[str, Any]:
     """The request with one user's rows as its history."""
     columns = [name for name in rows.columns if name != "user_id"]
     history = json.loads(rows[columns].to_json(orient="records"))
     # The id that `recommend` gives to the request of such a history.
-    request = {"request_id": f"0-{rows.timestamp.max()}"} | more
+    request = {"request_id": f"0-{rows.timestamp.max()}", "new_session": False} | more
     return {"user_id": int(rows.user_id.iloc[0]), "history": history, **request}
 
 

@@ -11,7 +11,7 @@ from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
 
 
 def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
-    """Random rows; rewards depend on items and the state."""
+    """Random rows of old items; rewards depend on items and the state."""
     rng = np.random.default_rng(0)
     shown = rng.integers(items, size=rows)
     x = rng.normal(size=(rows, 5)) @ rng.normal(size=(5, 5))  # correlated
@@ -34,7 +34,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         fitted_users=torch.arange(users),
         binary=binary,
         weights=torch.ones(rows),
-        running=torch.from_numpy(rng.normal(size=(rows, 2))).float(),
+        running=torch.from_numpy(rng.normal([0, 30, 6.58], [0.05, 0, 0], (rows, 3))).float(),
         interest=torch.from_numpy(rng.normal(size=(rows, 3))).float(),
         tastes=torch.from_numpy(rng.normal(size=rows)).float(),
         position=torch.eye(4)[rng.integers(4, size=rows), 1:],
@@ -71,11 +71,11 @@ def matrix(given: Design, name: str) -> sparse.csr_matrix:
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_is_that_of_a_penalised_regression(name: str, binary: bool) -> None:
-    given = design(600, binary)
-    found = fit_effects(given, {}, {name: 0.7})
-    penalty = given.penalty(name, 0.7)
+    given = design(33_000 if name == "running" else 600, binary)
+    found = fit_effects(given, given.mean_effect(), {name: 3.2})
+    penalty = given.penalty(name, 3.2)
     inputs, target = matrix(given, name), given.target.numpy()
-    assert penalty * 0.7**2 == pytest.approx(inputs.multiply(inputs).sum() / 600, rel=1e-4)
+    assert penalty * 3.2**2 == pytest.approx(inputs.multiply(inputs).sum() / len(target), rel=1e-4)
     if binary:
         reference = LogisticRegression(C=1 / penalty, tol=1e-8, max_iter=10_000)
     else:

@@ -18,7 +18,7 @@ from ucfrec.arrays import IntArray
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
-from ucfrec.recommending.recommend import SCORE, recommend, sessions_of
+from ucfrec.recommending.recommend import SCORE, decide, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 PARTS = ("policy", "exposure", "reward weight", "lookahead")
@@ -81,7 +81,7 @@ def explain(
         new = gap is not None and bool(time_ms - user.timestamps.max(initial=0) > gap)
     elif trained.offers is not None:
         at = int(user.timestamps.max(initial=0))
-    (frame,) = recommend(
+    ((frame, _),) = decide(
         trained,
         [user],
         k,

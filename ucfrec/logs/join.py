@@ -50,10 +50,8 @@ _ABSENT = {
     schema.EXCLUDES_SEEN: "false",
 }
 """Columns that exposures may lack, and SQL of what they then are."""
-_MEASURED = (schema.TIMESTAMP, schema.PROPENSITY)
-"""Columns that may differ where an exposure is written twice."""
-_ONE_EXPOSURE = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
-"""SQL of the columns that are equal where an exposure is written twice."""
+_ONE_EXPOSURE = ", ".join(n for n in _EXPOSURE if n not in (schema.TIMESTAMP, schema.PROPENSITY))
+"""SQL of the columns that are equal where an exposure is written twice; the others may differ."""
 _SAME_KEY = (
     "CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
     "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
@@ -98,10 +96,10 @@ def join_feedback(
 ) -> Joined:
     """Write a log of exposures with the feedback that they got.
 
-    A row of feedback belongs to the latest exposure of its user and item, and of its `request_id`
-    if it has one, that is at most `within_ms` older; to that one alone. Of several rows of feedback
-    the log has the largest value, other than 0, of every column that is a number or a truth value;
-    0 where there is none.
+    A row of feedback belongs to the latest exposure of its user and item that is at most
+    `within_ms` older; if it has one, of its `request_id`, and at most a minute newer. Of several
+    rows of feedback the log has the largest value, other than 0, of every column that is a number
+    or a truth value; 0 where there is none.
 
     An `InputNote` says which columns are left out, and what may be wrong if a fifth has no match.
 
@@ -133,7 +131,8 @@ def join_feedback(
                 f"SELECT f.row AS feedback_row, e.row FROM feedback f ASOF JOIN (SELECT user_id, "
                 f"item_id, timestamp, {request}, max(row) AS row FROM exposures GROUP BY ALL) e ON "
                 f"{_SAME_KEY} AND f.{_REQUEST} IS NOT DISTINCT FROM e.{_REQUEST} "
-                f"AND f.timestamp >= e.timestamp WHERE f.{_REQUEST} IS {missing} "
+                f"AND f.timestamp + if(f.{_REQUEST} IS NULL, 0, {schema.CLOCKS_DIFFER_MS}) "
+                f">= e.timestamp WHERE f.{_REQUEST} IS {missing} "
                 f"AND f.timestamp <= e.timestamp + {int(within_ms)}"
                 for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )

@@ -202,10 +202,10 @@ def pareto_tail(weights: Float64Array) -> float | None:
 
     From 0.5 on the variance is infinite (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted
     by Zhang & Stephens, Technometrics 2009. None where the largest fifth, or 3√n, have fewer than
-    ten different values: no tail.
+    ten different values, up to rounding errors of the mean: no tail.
     """
     size = int(min(0.2 * len(weights), 3 * len(weights) ** 0.5))
-    ordered = np.sort(weights)
+    ordered = np.sort(np.round(weights / (weights.mean() or 1.0), 4))
     excess = ordered[len(weights) - size :] - ordered[max(len(weights) - size - 1, 0)]
     excess = excess[excess > 0]
     if len(np.unique(excess)) < 10:

@@ -304,6 +304,7 @@ def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
     places = torch.arange(length, device=mask.device)
 
     def roll(x: Tensor, by: Tensor) -> Tensor:
-        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
+        rolled = (places + by) % length
+        return x.gather(1, rolled.unsqueeze(-1).expand_as(x))
 
     return roll(network(roll(inputs, padding))[0], -padding)

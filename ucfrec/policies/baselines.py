@@ -130,7 +130,8 @@ class PopularPolicy(ScoringPolicy):
         if isinstance(self.head, VectorHead):
             actions = torch.from_numpy(train.column(schema.ACTION))
             mean = actions.double().mean(0).to(self.head.scale) / self.head.scale
-            self.head.out.bias.copy_(torch.atanh(mean.clamp(-_WITHIN, _WITHIN)))
+            inside = mean.clamp(-_WITHIN, _WITHIN)
+            self.head.out.bias.copy_(torch.atanh(inside))
 
     @torch.no_grad()
     def _set_scores(self, train: EpisodeStore, validation: EpisodeStore | None) -> None:
@@ -181,8 +182,10 @@ class PopularPolicy(ScoringPolicy):
         if cls.scored_by == "likes":
             return torch.from_numpy(fit_mixture(scores.exp().numpy(), likes.numpy()))
         dislikes = held_out.shown - held_out.liked
-        terms = held_out.liked * F.logsigmoid(scores) + dislikes * F.logsigmoid(-scores)
-        best = len(scores) - 1 - int(terms.sum(1).flip(0).argmax())  # of equal ones, the longest
+        terms = held_out.liked * F.logsigmoid(scores)
+        terms = terms + dislikes * F.logsigmoid(-scores)
+        of_longest = terms.sum(1).flip(0)
+        best = len(scores) - 1 - int(of_longest.argmax())  # of equal ones, the longest
         return F.one_hot(torch.tensor(best), len(scores)).double()
 
 
@@ -270,7 +273,8 @@ class ItemKNNPolicy(ScoringPolicy):
         at_once = max(1, min(_ROWS, _AT_ONCE // shape[1]))
         for start in range(0, shape[1], at_once):
             rows = slice(start, start + at_once)
-            cosines = torch.from_numpy((columns[:, rows].T @ columns).toarray()).float()
+            products = (columns[:, rows].T @ columns).toarray()
+            cosines = torch.from_numpy(products).float()
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
     def make_solver(
@@ -296,7 +300,8 @@ class ItemKNNPolicy(ScoringPolicy):
         of_shown = scores.gather(1, items).mean()
         bias = self.head.get_parameter("bias").detach()
         seen = scores.new_zeros(len(scores), len(bias) + 1, dtype=torch.bool)
-        seen = seen.scatter_(1, shown.items % seen.shape[1], True)[:, :-1]  # the last is for none
+        places = shown.items % seen.shape[1]  # the last is for none
+        seen = seen.scatter_(1, places, True)[:, :-1]
         if not seen.gather(1, items).any():  # sessions in which no item is shown twice
             bias = bias.where(~seen, -torch.inf)
         low = 0.0
@@ -525,7 +530,8 @@ class BoostedPolicy(ScoringPolicy):
         )
         rates = torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
         attributes = (context, self.directions[items])
-        return torch.cat([rates, *(part.expand(*none.shape, -1) for part in attributes)], dim=-1)
+        expanded = [part.expand(*none.shape, -1) for part in attributes]
+        return torch.cat([rates, *expanded], dim=-1)
 
     def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
@@ -579,7 +585,8 @@ def _fit_pairs(
     attributes = sparse.csr_matrix((entries, columns.ravel(), bounds), shape)
     design, weighted = attributes[items], context.T * residuals
     spread, axes = np.linalg.eigh(context.T @ context)
-    spreads, bases = np.linalg.eigh((design.T @ design).toarray() / len(items))
+    moments = (design.T @ design).toarray() / len(items)
+    spreads, bases = np.linalg.eigh(moments)
     variance = np.outer(spread, spreads).clip(0)
 
     def solve(rows: BoolArray) -> Float64Array:

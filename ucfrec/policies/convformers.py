@@ -62,7 +62,8 @@ class DCPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        hidden = self.dropout(interleave(self.embed(windows, self.head.embed(windows.actions))))
+        tokens = self.embed(windows, self.head.embed(windows.actions))
+        hidden = self.dropout(interleave(tokens))
         valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
         *first_blocks, last = self.blocks
         for block in first_blocks:
@@ -235,7 +236,8 @@ class _DynamicConvolution(nn.Module):
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
-        values = F.glu(self.gated(hidden)).masked_fill(~valid.unsqueeze(-1), 0.0)
+        values = F.glu(self.gated(hidden))
+        values = values.masked_fill(~valid.unsqueeze(-1), 0.0)
         # Tokens are the last dimension: 60 numbers side by side, where a group's channels are two.
         taps = self.dropout(self.taps(values)).transpose(1, 2)
         taps = taps.reshape(batch, self.groups, self.kernel, tokens)

@@ -107,7 +107,8 @@ class CRMGreedyPolicy(SequencePolicy):
             return self._errors(windows)[:, -1].mean()
         states, items = windows.states[:, -1], windows.actions[:, -1]
         predicted = model.expect(model.score(states, Shown.before_last(windows), None, items))
-        return ((windows.rewards[:, -1] - predicted) / model.reward_std).square().mean()
+        errors = (windows.rewards[:, -1] - predicted) / model.reward_std
+        return errors.square().mean()
 
     def act(self, windows: Windows) -> Tensor:
         """At the last step: scores of all items (B, n_items) as of `ItemRewardModel.scores`, for

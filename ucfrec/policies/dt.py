@@ -80,7 +80,8 @@ class DTPolicy(SequencePolicy):
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), without what the last block has for other tokens."""
-        return self.attend(self.tokens(windows), windows.mask, slice(-2, -1))[:, 0]
+        tokens = self.tokens(windows)
+        return self.attend(tokens, windows.mask, slice(-2, -1))[:, 0]
 
 
 class Block(nn.Module):

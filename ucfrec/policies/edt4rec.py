@@ -67,9 +67,11 @@ class ConservativeQ(nn.Module):
         self.register_buffer("every", every)
         self.register_buffer("low", vectors.min(0).values)
         self.register_buffer("high", vectors.max(0).values)
-        self.register_buffer("unit", torch.tensor(float(np.abs(store.returns).max()) or 1.0))
+        largest = float(np.abs(store.returns).max())
+        self.register_buffer("unit", torch.tensor(largest or 1.0))
         inputs = len(mean) + vectors.shape[1]
-        self.network, self.target = (mlp(inputs, _HIDDEN, 2, 1) for _ in range(2))
+        self.network = mlp(inputs, _HIDDEN, 2, 1)
+        self.target = mlp(inputs, _HIDDEN, 2, 1)
         self.target.load_state_dict(self.network.state_dict())
         self.target.requires_grad_(False)
 
@@ -82,7 +84,8 @@ class ConservativeQ(nn.Module):
         """Values (M, C) of actions (M, C, A) in states (M, S), by `network` or the trained one."""
         states = standardise(states, self.state_mean, self.state_std)
         states = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
-        value: Tensor = (network or self.network)(torch.cat([states, actions], dim=-1))
+        inputs = torch.cat([states, actions], dim=-1)
+        value: Tensor = (network or self.network)(inputs)
         return value.squeeze(-1)
 
     def candidates(self, count: int) -> Tensor:
@@ -110,7 +113,8 @@ class ConservativeQ(nn.Module):
             target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
         value = self.q(batch.states, batch.actions.unsqueeze(1))[:, 0]
         values = self.q(batch.states, self.candidates(len(value)))
-        soft_maximum = torch.cat([values, value.unsqueeze(1)], dim=1).logsumexp(-1)
+        values = torch.cat([values, value.unsqueeze(1)], dim=1)
+        soft_maximum = values.logsumexp(-1)
         conservative = (soft_maximum - value).mean()
         error = 0.5 * F.mse_loss(value, target)
         return self.weight * conservative + error, {"td": error.detach()}

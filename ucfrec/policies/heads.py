@@ -210,7 +210,8 @@ class ItemHead(nn.Module):
             logits = self.exposure.added_to(logits, exposed, items)
         if exposed.offer is None:
             return logits
-        return logits.masked_fill(~exposed.offer.mask(items).to(logits.device), -torch.inf)
+        available = exposed.offer.mask(items).to(logits.device)
+        return logits.masked_fill(~available, -torch.inf)
 
     def losses(
         self,
@@ -255,7 +256,8 @@ class ItemHead(nn.Module):
             return of_all
         _, logits, log_weights = self._sample_logits(features, exposed)
         logs = logits.log_softmax(-1)
-        estimate: Tensor = -(logs.exp() * (logs - log_weights)).sum(-1).mean()
+        terms = logs.exp() * (logs - log_weights)
+        estimate: Tensor = -terms.sum(-1).mean()
         return estimate
 
     def _sample_logits(

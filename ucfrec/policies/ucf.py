@@ -250,7 +250,8 @@ def draw_mask(shape: torch.Size, p: float) -> Tensor:
     if dropped == _LEVELS:
         return torch.zeros(shape)
     mask = torch.empty(shape)
-    draws = torch.empty(-(-mask.numel() // 4), dtype=torch.int64).random_(-(2**63), None)
+    count = -(-mask.numel() // 4)  # four levels a number
+    draws = torch.empty(count, dtype=torch.int64).random_(-(2**63), None)
     levels = draws.view(torch.int16)[: mask.numel()].view(shape)
     torch.ge(levels, dropped - _LEVELS // 2, out=mask)
     return mask.mul_(_LEVELS / (_LEVELS - dropped))

@@ -192,7 +192,9 @@ class ExposureLog:
             sets, self._sets, ids, self._ids = self._sets, {}, self._ids, 0
         if not count:
             return
-        name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
+        # Feedback of what is shown before midnight may be of the next day, not of the day before.
+        oldest = datetime.fromtimestamp(waiting[0][1] / 1000, UTC)
+        name = f"exposures-{oldest:%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
         try:
             write_sets(self._folder / name, _tabulate_sets(sets))
             with atomic_file(self._folder / name) as scratch:

@@ -12,6 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
@@ -21,8 +22,9 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.candidates import name_set
-from ucfrec.logs.histories import Histories
+from ucfrec.logs.histories import HISTORIES, Histories
 from ucfrec.logs.rows import mix_bits
+from ucfrec.logs.summary import note_unknown
 from ucfrec.recommending.requests import TIME_FORMS, parse_time
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, require_whole
@@ -52,16 +54,6 @@ _MORE = 256
 """Candidates that are scored beside four times those requested."""
 _SAMPLE = 32
 """One in so many sessions is also searched exactly."""
-
-
-def recommend(
-    trained: TrainedPolicy,
-    batches: Iterable[Histories],
-    k: int,
-    **how: Any,
-) -> Iterator[pd.DataFrame]:
-    """The frames of `decide`, which takes the same arguments."""
-    return (frame for frame, _ in decide(trained, batches, k, **how))
 
 
 def decide(
@@ -126,7 +118,7 @@ def decide(
         told_apart += f"-{name_set(trained.items.ids[allowed])}"
     _require_available(trained, chooser.request_times(1), allowed)
 
-    def to_frame(batch: Histories) -> tuple[pd.DataFrame, IntArray]:
+    def make_frame(batch: Histories) -> tuple[pd.DataFrame, IntArray]:
         histories = batch.with_numbers(trained.items, filter_seen)
         if not (skip_unknown or (histories.item_ids >= 0).all()):
             raise _refuse_unknown(trained.items, [batch, *remaining])
@@ -151,7 +143,16 @@ def decide(
         )
         return frame, np.repeat(began, counts)
 
-    return map(to_frame, remaining)
+    def make_frames() -> Iterator[tuple[pd.DataFrame, IntArray]]:
+        count = unknown = 0
+        for batch in remaining:
+            count += len(batch.users)
+            unknown += int((trained.users.numbers(batch.users) < 0).sum())
+            yield make_frame(batch)
+        if len(trained.user_ids):
+            note_unknown(HISTORIES, schema.USER_ID, unknown, count, "the run was trained on")
+
+    return make_frames()
 
 
 def _require_available(trained: TrainedPolicy, time: Tensor, allowed: IntArray | None) -> None:
@@ -193,7 +194,8 @@ class Chooser:
 
     def request_times(self, count: int) -> Tensor:
         """(count,) int64 ms, all the same."""
-        return torch.full((count,), round(time.time() * 1000) if self.at_ms is None else self.at_ms)
+        at_ms = 1000 * time.time() if self.at_ms is None else self.at_ms
+        return torch.full((count,), round(at_ms))
 
     def choose(
         self,
@@ -305,10 +307,8 @@ class Chooser:
 
 def _pad_lists(lists: Sequence[IntArray], width: int) -> Tensor:
     """The numbers of each list (U, width), and −1."""
-    padded = torch.full((len(lists), width), -1)
-    for row, numbers in zip(padded, lists, strict=True):
-        row[: len(numbers)] = torch.from_numpy(numbers)
-    return padded
+    padded = pad_sequence(list(map(torch.from_numpy, lists)), batch_first=True, padding_value=-1)
+    return F.pad(padded, (0, width - padded.shape[1]), value=-1)
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:

@@ -54,8 +54,7 @@ _ROWS = "history"
 """Name of the rows in messages and in the engine."""
 _MEMORY = "512MB"
 """Half of it is the engine's: a request has some megabytes, and no expression needs much more."""
-
-
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 TIME_FORMS = "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
 
 
@@ -70,9 +69,6 @@ def parse_time(value: float | str) -> float:
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
     except (ValueError, OverflowError):
         raise ValueError(TIME_FORMS) from None
-
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @settings_table("")
@@ -125,8 +121,9 @@ class Request(BaseModel):
     # Not `Id`, as checking the range of every one takes as long as reading it.
     candidates: Annotated[list[int | str], Field(min_length=1, fail_fast=True)] | None = None
     """The only items to recommend."""
-    new_session: bool = False
-    """Whether the user begins a new session. Otherwise the latest one of the history goes on."""
+    new_session: bool | None = None
+    """Whether the user begins a new session, or the latest one of the history goes on. Without it,
+    a pause since then that is longer than the run's gap ends that one."""
     request_id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     """Identifies the request: a repetition gets the same items. Without one, the server makes one.
     """

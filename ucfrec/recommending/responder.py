@@ -1,6 +1,7 @@
 """Answers to requests of several users at once, equal to those of `ucfrec recommend`; by one run,
 or by several that share the users, replaced as the server runs."""
 
+import math
 import sys
 import threading
 import time
@@ -100,6 +101,13 @@ class _Question(NamedTuple):
     history: Histories
     candidates: IntArray | None
 
+    def begins_session(self, ended_ms: float) -> bool:
+        """Whether the request says so or, if it does not say, its last row is before a time."""
+        stated = self.request.new_session
+        if stated is None:
+            return bool(self.history.timestamps.max(initial=0) < ended_ms)
+        return stated
+
 
 class Responder:
     """A trained policy under its rule, which answers requests; for one thread at a time.
@@ -148,24 +156,19 @@ class Responder:
             trained.record.observation_size,
             RowRewards(reward_of(trained)),
         )
-        self._unknown = {"unknown_items": Mean(0, 0), "unknown_users": Mean(0, 0)}
+        self._means = dict.fromkeys(("unknown_items", "unknown_users", "new_sessions"), Mean(0, 0))
 
     def drift(self) -> dict[str, Mean]:
-        """Share of unknown items among rows of histories, and of unknown users among requests, so
-        far; and the drift that the run's update found, as `update_…`."""
+        """Share of unknown items among rows of histories, and of unknown users and new sessions
+        among requests, so far; and the drift that the run's update found, as `update_…`."""
         update = self.trained.record.update
         drift = (update and update.drift) or {}
         means = {f"update_{name}": Mean(float(value), 1.0) for name, value in drift.items()}
-        return means | self._unknown
+        return means | self._means
 
-    def _count_unknown(
-        self,
-        what: str,
-        count: int,
-        of: int,
-    ) -> None:
-        total, weight = self._unknown[what]
-        self._unknown[what] = Mean(total + count, weight + of)
+    def _add_to_mean(self, name: str, count: int, of: int) -> None:
+        total, weight = self._means[name]
+        self._means[name] = Mean(total + count, weight + of)
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""
@@ -196,7 +199,7 @@ class Responder:
             numbered = history.with_numbers(items, self._filter_seen)
             unknown = numbered.item_ids < 0
             count, rows = int(unknown.sum()), len(unknown)
-            self._count_unknown("unknown_items", count, rows)
+            self._add_to_mean("unknown_items", count, rows)
             if count and not self._skip_unknown:
                 names = name_some(sorted(set(history.item_ids[unknown].tolist())))
                 raise InputError(
@@ -214,31 +217,30 @@ class Responder:
     def _answer(self, questions: Sequence[_Question]) -> Iterator[Answer]:
         histories = Histories.joined([question.history for question in questions])
         unknown = int((self.trained.users.numbers(histories.users) < 0).sum())
-        self._count_unknown("unknown_users", unknown, len(questions))
-        numbers, scores, propensities, began = self._chooser.choose(
+        self._add_to_mean("unknown_users", unknown, len(questions))
+        ended_ms = 1000 * time.time() - (self.trained.record.session_gap_ms or math.inf)
+        new = np.asarray([question.begins_session(ended_ms) for question in questions])
+        self._add_to_mean("new_sessions", int(new.sum()), len(questions))
+        items, scores, propensities, began = self._chooser.choose(
             histories,
             np.asarray([question.request_id for question in questions], dtype=object),
             max(question.k for question in questions),
-            np.asarray([question.request.new_session for question in questions]),
+            new,
             [question.candidates for question in questions],
         )
         # Items that may not be recommended come last.
-        counts = np.isfinite(scores).sum(1).tolist()
-        columns = (
-            values.tolist() for values in (self.trained.items.ids[numbers], scores, propensities)
-        )
-        for question, count, start, *lists in zip(
-            questions, counts, began.tolist(), *columns, strict=True
-        ):
-            items, logs, chances = (values[: min(count, question.k)] for values in lists)
+        counts = np.isfinite(scores).sum(1)
+        columns = counts, began, self.trained.items.ids[items], scores, propensities
+        for question, count, start, *lists in zip(questions, *columns, strict=True):
+            ids, logs, chances = (values[: min(count, question.k)].tolist() for values in lists)
             numbers = question.candidates
             yield Answer(
-                items,
+                ids,
                 logs,
                 chances,
                 question.request_id,
                 *self._source,
-                session_began=start,
+                session_began=int(start),
                 excludes_seen=self._filter_seen,
                 candidates=None if numbers is None else self.trained.items.ids[numbers],
             )
@@ -352,8 +354,8 @@ class Served:
         if current == self._known:
             return
         self._known, (pointer, _) = current, current
-        same_run = pointer.fingerprint in ("", self.trained.fingerprint)
-        if pointer.current == self._arms[0].name and same_run:
+        answering = self._arms[0].name, self.trained.fingerprint
+        if (pointer.current, pointer.fingerprint) == answering:
             self._refused = None
         else:
             self._replace(pointer)
@@ -380,7 +382,6 @@ class Served:
                 f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
                 "or ucfrec promote one"
             )
-        pointer.run(self._folder)
         return pointer, (self._folder / POINTER).stat().st_mtime_ns
 
     def _run(self, seconds: float) -> None:

@@ -38,7 +38,7 @@ def recommend_with_spark(
     memory_limit: str = "2GB",
     **how: Any,
 ) -> int:
-    """Write the `k` best next items of every user of logs, as `recommend` finds them; returns their
+    """Write the `k` best next items of every user of logs, as `decide` finds them; returns their
     number. InputError if an argument or the logs cannot be used, or Spark is missing or fails.
 
     Args:
@@ -49,7 +49,7 @@ def recommend_with_spark(
         exposures: folder for what was shown; None for none.
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
-        filter_seen, at, how: as of `recommend`; `how` are `skip_unknown`, `new_session` and `seed`.
+        filter_seen, at, how: as of `decide`; `how` are `skip_unknown`, `new_session` and `seed`.
     """
     how |= {"k": k, "rule": rule or trained.rule, "filter_seen": filter_seen, "at": at}
     recommended: Any = partial(decide, **how)

@@ -135,8 +135,8 @@ class _Metrics:
         text = "Requests that wait for a forward pass."
         self.waiting = Gauge("ucfrec_waiting_requests", text, **live)
         text = (
-            "Unknown items and users of requests, shares since the run began to answer; and the "
-            "drift that the run's update found (update_…)."
+            "Unknown items and users and new sessions of requests, shares since the run began to "
+            "answer; and the drift that the run's update found (update_…)."
         )
         self._totals = Gauge(_DRIFT, text, ["measure"], **live)
         self._weights = Gauge(_WEIGHT, text, ["measure"], **live)

@@ -59,7 +59,9 @@ def compare_runs(
         propensity = rows.column(schema.PROPENSITY).astype(np.float64)
     weighed = np.flatnonzero(propensity > 0)
     # Clicks favour the run that showed the items: they are weighted as if shown uniformly.
-    shares = np.where(propensity > 0, propensity, np.inf) if len(weighed) else np.ones(len(reward))
+    shares = np.ones(len(reward))
+    if len(weighed):
+        shares = np.where(propensity > 0, propensity, np.inf)
     likes = liked / shares
     counted, faults = np.flatnonzero(likes), list[str]()
     if len(counted):
@@ -169,7 +171,8 @@ def popularity_index(old: Array, new: Array) -> float:
     """`stability_index` of steps per item (n_items,), in groups of about equal old popularity."""
     order = np.argsort(-old, kind="stable")
     more_popular = np.cumsum(old[order]) - old[order]
-    group = np.minimum(_GROUPS * more_popular // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)
+    group = _GROUPS * more_popular // max(old.sum(), 1)
+    group = np.minimum(group, _GROUPS - 1).astype(np.int64)
     counts = [np.bincount(group, items[order], _GROUPS) for items in (old, new)]
     return stability_index(counts[0], counts[1])
 

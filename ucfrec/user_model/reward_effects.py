@@ -357,13 +357,18 @@ def _scale(
 
 
 def _moments(design: Design, inputs: Tensor) -> Tensor:
-    return inputs.T @ (design.weights.unsqueeze(1) * inputs)
+    """Weighted second moments, float64: ages and rates of items differ by orders of magnitude."""
+    moments = torch.zeros((inputs.shape[1],) * 2, dtype=torch.float64)
+    for rows in torch.split(torch.arange(len(inputs)), 2**14):
+        part, weights = inputs[rows].double(), design.weights[rows]
+        moments += part.T @ (weights.unsqueeze(1) * part)
+    return moments
 
 
 def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
     """U and its inverse with UᵀU = moments + ridge · I, for square matrices."""
     identity = torch.eye(len(moments), dtype=torch.float64)
-    upper = torch.linalg.cholesky(moments.double() + (ridge + _SMALLEST) * identity).T
+    upper = torch.linalg.cholesky(moments + (ridge + _SMALLEST) * identity).T
     return upper.float(), torch.linalg.solve_triangular(upper, identity, upper=True).float()
 
 

@@ -17,7 +17,7 @@ from ucfrec.logs.sessions import Moments
 
 
 def make_log(rows: int = 4000) -> pd.DataFrame:
-    log = random_log(rows, users=400, step=200_000)
+    log = random_log(rows, users=400, step=5_000)
     generator = np.random.default_rng(1)
     return log.assign(revenue=np.where(generator.random(rows) < 0.03, 9.9, np.nan))
 
@@ -75,7 +75,7 @@ def test_the_largest_five_bots_are_named(tmp_path: Path) -> None:
     (note,) = notes_of(path)
     assert "2000 (500 rows), " in note
     assert note.count("(300 rows)") == 4
-    assert "the median session has 1 row, " in note
+    assert "the median session has 2 rows, " in note
     assert '--where "user_id NOT IN (2000, ' in note
     assert not notes_of(path, max_session=100)
     report = validate([path], LogMapping(where="USER_ID < 1000"))

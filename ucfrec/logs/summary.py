@@ -307,6 +307,14 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
             "between; check --column item_id and --where",
         )
+    users, sessions, steps = (report[name] for name in ("users", "sessions", "steps"))
+    if sessions > 2 * users and steps < 2 * sessions:
+        _note(
+            rows,
+            f"users have {steps / users:.1f} rows, but sessions {steps / sessions:.1f}, and "
+            "policies do not see the rows before a session; for ratings, purchases and the like, "
+            "say --session-by user",
+        )
     # Of training, because held-out episodes may be the last row of each user.
     (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES} WHERE split = 0")
     longest = rows.log.connection.sql(

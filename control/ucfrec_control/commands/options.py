@@ -3,7 +3,7 @@
 import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,10 +25,9 @@ from ucfrec_control.environments.scores import find_task
 
 def finite_number(text: str) -> float:
     """The number that `text` is. ArgumentTypeError if it is none, or not finite."""
-    try:
+    value = math.nan
+    with suppress(ValueError):
         value = float(text)
-    except ValueError:
-        value = math.nan
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text:.40} is not a finite number")
     return value

@@ -12,7 +12,7 @@ from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.commands.reproduce import PARTS
 from ucfrec_control.data.distractor import DISTRACTORS
-from ucfrec_control.figures.figures import make_row_figures
+from ucfrec_control.figures.figures import draw_plans, plan_rows
 
 LAST = {"suite": SCORES, "metric": "score", "checkpoint": "last"}
 
@@ -60,7 +60,7 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
             for seed in range(2)
             for own in [{"training_seed": seed, "conditions": conditions}]
         ]
-        made = {file.name for file in make_row_figures(rows, tmp_path)}
+        made = {file.name for file in draw_plans(plan_rows(rows), tmp_path)[0]}
         wanted = "robustness-small-d.png" if robust else f"scores-small-{part.table}.png"
         assert wanted in made
     assert {*tmp_path.glob("lambda-*.png")} == {

@@ -65,9 +65,14 @@ def test_another_environment_version_warns(folder: Path) -> None:
     assert not mismatches({"env_id": "Tank-v0", "versions": {}}, "mine:Tank-v0")
 
 
-def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_path: Path) -> None:
+def test_behaviour_cloning_has_no_target(
+    folder: Path, store: EpisodeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cloned, asked = tmp_path / "bc", (*LAST, "--target", 100)
-    train_control(store, cloned, resolve_config("bc", None, TINY))
+    # The version of a plug-in's package is recorded.
+    monkeypatch.setattr("ucfrec_control.training.train.policy_package", lambda name: "pytest")
+    record = train_control(store, cloned, resolve_config("bc", None, TINY))
+    assert record.versions["pytest"] == pytest.__version__
     (row,) = evaluate_run(cloned, episodes=1, seed=0, checkpoints=("last",))
     assert (row["target_return"], row["rule"]) == (None, "no target return")
     assert f"no target return is taken by {cloned} (bc)" in refused("evaluate", cloned, *asked)
@@ -85,7 +90,8 @@ def test_data_runs_no_code(folder: Path, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "rows.json"
-    control("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
+    asked = ("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
+    assert f"\n{MADE} + distractor  dc" in control(*asked)[0]
     (row,) = read_results(out)
     assert [[*d.values()] for d in row.details["distractors"]] == [[11, 0.15, 0, False]]
     env = make_env("Hopper-v5", 2, [0.0])
@@ -111,8 +117,9 @@ def test_the_weights_of_the_highest_validation_return_are_kept(
     assert about == {"step": 4, "return": 5.0}
     asked = ("--episodes", 1, "--checkpoint", "return", "--json", out)
     control("evaluate", tmp_path / "run", *asked)
-    assert {row.checkpoint for row in read_results(out)} == {"return"}
-    assert "return.safetensors does not exist" in refused("evaluate", folder / "store-run", *asked)
+    # One episode has no interval.
+    assert {(row.checkpoint, row.interval) for row in read_results(out)} == {("return", None)}
+    assert "train with --select-by-return" in refused("evaluate", folder / "store-run", *asked)
 
 
 def test_presets_are_those_of_the_papers() -> None:

@@ -40,7 +40,6 @@ def test_seeds_that_are_none_are_refused() -> None:
         ("benchmark --method nope", "no method is called nope; there are bc, bc-10"),
         ("benchmark --seeds 0", "--seeds: 0 is not"),
         ("benchmark --context nope=8", "nope=8 is not METHOD=STEPS"),
-        ("benchmark --context ucf=0", "ucf=0 is not METHOD=STEPS"),
         ("benchmark --file nowhere", "nowhere.hdf5 does not exist"),
         ("benchmark --results rows.jsonl", "rows.jsonl, line 1 is not a result row"),
         ("figures --out out", "name runs with --runs, or"),

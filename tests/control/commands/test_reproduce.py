@@ -73,7 +73,7 @@ def small(**conditions: object) -> dict[str, object]:
 
 
 def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -> None:
-    of = LAST | {"task": "hopper_medium-zoo"}
+    of = LAST | {"task": "d\x1b[2J\nforged"}
     rows = [
         result_row(41.5, **of, table=MAIN, method="ucf", conditions=small()),
         result_row(42.5, **of, table=MAIN, method="bc", conditions=small()),
@@ -84,6 +84,7 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -
     asked = ("--show-only", "--results", results, "--out", tmp_path / "out")
     printed = control("reproduce", "table-1", *asked)[0]
     assert [score in printed for score in ("41.5", "42.5", "43.5", "44.5")] == [True] + [False] * 3
+    assert "d\\x1b[2J forged" in printed
     assert "no rows of table-9" in refused("reproduce", "table-9", *asked)
     assert "drawn from its runs" in refused("reproduce", "figure-5", *asked)
 
@@ -97,14 +98,6 @@ def test_rows_that_lack_what_is_shown_are_one_clear_error(tmp_path: Path) -> Non
         append_rows(results, [result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)])
         said = refused(command, "--show-only", "--results", results)
         assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
-
-
-def test_names_of_foreign_rows_do_not_steer_the_terminal(tmp_path: Path) -> None:
-    results, of = tmp_path / "rows.jsonl", LAST | {"task": "d\x1b[2J\nforged"}
-    append_rows(results, [result_row(1.0, **of, conditions=small())])
-    printed = control("benchmark", "--show-only", "--results", results)[0]
-    assert "\x1b" not in printed
-    assert "d\\x1b[2J forged" in printed
 
 
 def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(tmp_path: Path) -> None:

@@ -65,14 +65,9 @@ def test_another_environment_version_warns(folder: Path) -> None:
     assert not mismatches({"env_id": "Tank-v0", "versions": {}}, "mine:Tank-v0")
 
 
-def test_behaviour_cloning_has_no_target(
-    folder: Path, store: EpisodeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_path: Path) -> None:
     cloned, asked = tmp_path / "bc", (*LAST, "--target", 100)
-    # The version of a plug-in's package is recorded.
-    monkeypatch.setattr("ucfrec_control.training.train.policy_package", lambda name: "pytest")
-    record = train_control(store, cloned, resolve_config("bc", None, TINY))
-    assert record.versions["pytest"] == pytest.__version__
+    train_control(store, cloned, resolve_config("bc", None, TINY))
     (row,) = evaluate_run(cloned, episodes=1, seed=0, checkpoints=("last",))
     assert (row["target_return"], row["rule"]) == (None, "no target return")
     assert f"no target return is taken by {cloned} (bc)" in refused("evaluate", cloned, *asked)
@@ -110,14 +105,15 @@ def test_the_weights_of_the_highest_validation_return_are_kept(
         return Episodes(np.array([next(returns)]), np.array([1]))
 
     monkeypatch.setattr(selection, "play", play)
+    monkeypatch.setattr("ucfrec_control.training.train.policy_package", lambda name: "pytest")
     where = (folder / "store", "--out", tmp_path / "run", "--policy", "dt")
     longer = set_options((*TINY, "train.steps=6"))
     control("train", *where, *longer, "--select-by-return", 1, "--env", "Hopper-v4")
     _, about = load_tensors(tmp_path / "run" / "policy" / "return.safetensors")
     assert about == {"step": 4, "return": 5.0}
+    assert read_json(tmp_path / "run" / "run.json")["versions"]["pytest"] == pytest.__version__
     asked = ("--episodes", 1, "--checkpoint", "return", "--json", out)
     control("evaluate", tmp_path / "run", *asked)
-    # One episode has no interval.
     assert {(row.checkpoint, row.interval) for row in read_results(out)} == {("return", None)}
     assert "train with --select-by-return" in refused("evaluate", folder / "store-run", *asked)
 

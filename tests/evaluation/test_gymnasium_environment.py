@@ -39,6 +39,9 @@ def test_single_items_are_numbered_from_0(name: str, first: int) -> None:
     env.reset(seed=0)
     _, rewards, _, _, _ = env.step(np.array([0, 3, 1]))
     np.testing.assert_array_equal(rewards, first + np.array([0, 3, 1]))
+    for actions in ([0, 1], [[0]] * 3, [0, 1, ITEMS], [-1, 0, 1], [0.5, 0, 1]):
+        with pytest.raises(InputError, match=r"3 sessions take one action of Discrete\(4\) each"):
+            env.step(np.array(actions))
 
 
 def test_vectors_are_played_within_their_bounds() -> None:
@@ -46,6 +49,8 @@ def test_vectors_are_played_within_their_bounds() -> None:
     env.reset(seed=0)
     _, rewards, _, _, _ = env.step(np.array([[0.5, -9, 9], [0, 0, 0]], dtype=np.float32))
     np.testing.assert_allclose(rewards, [0.5 - 1 + 2, 0])
+    with pytest.raises(InputError, match=r"2 sessions take .* of shape \(3, 3\)"):
+        env.step(np.zeros((3, 3), dtype=np.float32))
 
 
 def test_named_entries_are_observed_in_their_order() -> None:

@@ -52,8 +52,7 @@ class RuleConfig:
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are excluded, where items have tags."""
     tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)
-    """Candidates for how often in a row one main tag may be liked, where the log shows that more
-    causes fatigue."""
+    """Candidates for how often in a row one main tag may be liked, where more causes fatigue."""
     keep_hits: Share = 0.9
     """Without true sessions: least share of the liked items found without the reward model that a
     reward weight must leave."""

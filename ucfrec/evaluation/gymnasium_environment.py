@@ -36,10 +36,9 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     Actions are items 0 to n − 1 where the environment's are `Discrete(n)` or `MultiDiscrete([n])`,
     and vectors (A,) where they are a `Box`; vectors are clipped to its bounds.
-
     Observations are vectors (O,): of a dict observation the entries `observe`, one after the other;
-    any other observation as a whole, numbers as they are and categories one-hot. O is 0 where items
-    are recommended and nothing is chosen from a dict, or the observation has no fixed size.
+    any other observation as a whole, numbers as they are and categories one-hot. O is 0 for items
+    if nothing is chosen from a dict, or the observation has no fixed size.
 
     Of `info`, the environment passes on `user_id`, a whole number. One that `reset` gives is that
     of the whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a
@@ -47,12 +46,7 @@ class GymnasiumEnvironment(SyncVectorEnv):
     or played, or lacks the entries `observe`; or later, if it gives only some sessions a `user_id`.
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        num_envs: int,
-        observe: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}; at least one session must be simulated")
         make = partial(_Session, env_id, tuple(observe))
@@ -76,7 +70,18 @@ class GymnasiumEnvironment(SyncVectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Take one item or vector as action in each session, (N,) or (N, A)."""
+        """Take one item or vector as action in each session, (N,) or (N, A); InputError if they
+        have another shape, or are not items of the environment."""
+        space, actions = self.action_space, np.asarray(actions)
+        if isinstance(space, spaces.Box):
+            fits = actions.shape == space.shape
+        else:
+            fits = actions.dtype.kind in "iu" and space.contains(actions)
+        if not fits:
+            raise InputError(
+                f"{self.num_envs} sessions take one action of {self.single_action_space} each, not "
+                f"an array of {actions.dtype} of shape {actions.shape}: {actions.tolist()!s:.60}"
+            )
         played = super().step(actions)
         self._require_all_users(played[-1])
         return played
@@ -95,11 +100,7 @@ class GymnasiumCatalog(GymnasiumEnvironment):
     """A `GymnasiumEnvironment` of items, not vectors, whose features `items` reads."""
 
     def __init__(
-        self,
-        env_id: str,
-        num_envs: int,
-        items: Items,
-        observe: Sequence[str] = (),
+        self, env_id: str, num_envs: int, items: Items, observe: Sequence[str] = ()
     ) -> None:
         super().__init__(env_id, num_envs, observe)
         space = self.single_action_space
@@ -242,8 +243,7 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
 
 def _table(values: Array, source: str, n_items: int) -> pa.Table:
     """The item table of an array (n_items,) or (n_items, D)."""
-    numbers = values.dtype.kind in "biuf"
-    if not numbers or values.ndim not in (1, 2) or len(values) != n_items:
+    if values.dtype.kind not in "biuf" or values.ndim not in (1, 2) or len(values) != n_items:
         raise InputError(
             f"--item-features {source} is an array of {values.dtype} of shape {values.shape}; give "
             f"numbers with one row for each of the {n_items} items"

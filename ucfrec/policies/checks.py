@@ -104,7 +104,8 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
     first, acts = _outputs(policy, windows)
     second, other_acts = _outputs(policy, changed)
     unchanged = windows.mask & ~later
-    if _alike(first[unchanged], second[unchanged]) and _alike(acts[::2], other_acts[::2]):
+    same_features = _alike(first[unchanged], second[unchanged])
+    if same_features and _alike(acts[::2], other_acts[::2]):
         return
     if not _alike(first, _outputs(policy, windows)[0]):
         _refuse(policy, "gives other features for the same windows; draw only if self.training")

@@ -150,7 +150,8 @@ def attend(
     are `visible` (B, 1, M, L), some in each row; drops weights as `Dropout`."""
     size = query.shape[0], -1, heads, query.shape[2] // heads
     # (B, L, d) -> (B, H, L, d/H)
-    query, key, value = (x.view(size).transpose(1, 2) for x in (query, key, value))
+    split = (x.view(size).transpose(1, 2) for x in (query, key, value))
+    query, key, value = split
     if dropout == 0 or query.device.type != "cpu":
         mixed = F.scaled_dot_product_attention(query, key, value, visible, dropout)
     else:

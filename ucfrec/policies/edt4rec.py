@@ -107,7 +107,8 @@ class ConservativeQ(nn.Module):
     def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
         """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD², and scalars; moves the target network."""
         with torch.no_grad():
-            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
+            pairs = zip(self.target.parameters(), self.network.parameters(), strict=True)
+            for slow, fast in pairs:
                 slow.lerp_(fast, _TARGET_RATE)
             next_values = self.state_values(batch.next_states, self.target)
             target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)

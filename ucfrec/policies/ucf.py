@@ -321,7 +321,8 @@ class _ShiftedProducts(torch.autograd.Function):
         ctx.save_for_backward(steps, taps)
         out = torch.addcmul(bias, steps, taps[-1])
         for back in range(1, len(taps)):
-            out[:, back:].addcmul_(steps[:, :-back], _taps_of_later(taps[-1 - back], back))
+            later = _taps_of_later(taps[-1 - back], back)
+            out[:, back:].addcmul_(steps[:, :-back], later)
         return out
 
     @staticmethod

@@ -240,15 +240,18 @@ class UserSimulator:
         """(M, O) observations before the next step."""
         if not self._store.observation_size:
             return np.zeros((len(self._numbers), 0), dtype=np.float32)
-        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
-        values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
+        values = self._store.step_values(schema.OBSERVATION, self._episodes, self._logged_steps)
         return np.asarray(values, dtype=np.float32)
 
     @property
     def offer(self) -> Offer | None:
         """What is on offer at the next step, at the time of the logged one; None for everything."""
-        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
-        return self._store.offer(self._episodes, steps)
+        return self._store.offer(self._episodes, self._logged_steps)
+
+    @property
+    def _logged_steps(self) -> IntArray:
+        """(M,) logged steps that the next ones stand for."""
+        return self._sessions.steps.numpy().clip(max=self._store.lengths[self._episodes] - 1)
 
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
         """Show one item (M,) in every session: rewards (M,), and positions of those that go on;

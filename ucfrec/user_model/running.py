@@ -88,8 +88,7 @@ class RunningRates:
     @classmethod
     def of(cls, store: EpisodeStore, target: Callable[[Tensor], Tensor]) -> "RunningRates | None":
         """The rates of all rows of a store, those at a time of rows in earlier bins, whose rewards
-        (N,) `target` turns into what is predicted, from 0 to 1 or standardised; None if its items
-        are always available."""
+        (N,) `target` turns into what is predicted; None if its items are always available."""
         if not store.has_offers:
             return None
         view = store.whole

@@ -10,7 +10,7 @@ from ucfrec.commands.options import ARGUMENT, POSITIVE, SEED, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow, write_results
-from ucfrec_control.commands.options import target_given
+from ucfrec_control.commands.options import finite_number
 from ucfrec_control.training.evaluate import CHECKPOINTS, evaluate_run, takes_target
 from ucfrec_control.training.rl_baselines import read_run
 from ucfrec_control.training.video import record_episode
@@ -32,11 +32,11 @@ class Evaluate(Table):
     """Episodes of each policy and target."""
     seed: Annotated[int, SEED] = 0
     """Of the episodes: environments have this seed and up to 49 more, so others begin 50 later"""
-    target: Annotated[Sequence[float], target_given] = ()
+    target: Annotated[Sequence[float], finite_number] = ()
     """Target return; repeatable (default: the preset's, else the largest of the training)"""
     checkpoint: Literal["both", "best", "last", "return"] = "both"
     """Weights to evaluate."""
-    distractor: float = 0.0
+    distractor: Annotated[float, finite_number] = 0.0
     """Value that distractors are fixed to."""
     reference: Annotated[tuple[float, float] | None, "LOW HIGH"] = None
     """Returns that score 0 and 100 (default: D4RL's for its tasks, none for others)"""
@@ -90,15 +90,15 @@ def _explain_targets(runs: Sequence[Path]) -> None:
 
 
 def _shown(row: ResultRow) -> dict[str, Any]:
-    """A row with its score or return, interval and target as text."""
-    low, high = row.interval or (row.value, row.value)
-    value = {row.metric: f"{row.value:.1f} [{low:.1f}, {high:.1f}]"}
+    """A row with its score or return, interval and target as text, and what was added to its
+    data."""
+    interval = "" if row.interval is None else " [{:.1f}, {:.1f}]".format(*row.interval)
     return {
         **dict.fromkeys(SHOWN),
         **row.as_line(),
-        "dataset": row.task,
+        "dataset": row.task + " + distractor" * len(row.details.get("distractors", ())),
         "seed": row.training_seed,
         "target_return": "none" if row.target_return is None else f"{row.target_return:g}",
         "return": f"{row.metrics['return']:.1f}",
-        **value,
+        row.metric: f"{row.value:.1f}{interval}",
     }

@@ -3,7 +3,7 @@
 import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,27 +23,18 @@ from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
 
 
-def target_given(text: str) -> float:
-    """The value of `--target`.
-
-    Raises:
-        ArgumentTypeError: `text` is no finite number.
-    """
-    try:
+def finite_number(text: str) -> float:
+    """The number that `text` is. ArgumentTypeError if it is none, or not finite."""
+    value = math.nan
+    with suppress(ValueError):
         value = float(text)
-    except ValueError:
-        value = math.nan
     if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text:.40} is no target; give a number")
+        raise argparse.ArgumentTypeError(f"{text:.40} is not a finite number")
     return value
 
 
 def context_given(text: str) -> tuple[str, int]:
-    """The value of `--context`.
-
-    Raises:
-        ArgumentTypeError: `text` is not METHOD=STEPS.
-    """
+    """The value of `--context`. ArgumentTypeError if `text` is not METHOD=STEPS."""
     method, _, steps = text.partition("=")
     if method not in METHODS or not steps.isdecimal() or not 1 <= int(steps[:6]) <= 1000:
         raise argparse.ArgumentTypeError(f"{text:.40} is not METHOD=STEPS, as in ucf=8")

@@ -64,8 +64,7 @@ _BOTH = (PAPER_UCF, "ucf")
 PARTS: Final[Mapping[str, Part]] = {
     "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, *_BOTH)),
     "table-3": Part(
-        MAIN,
-        (PAPER_UCF, *PAPER_ABLATIONS, "ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES),
+        MAIN, (PAPER_UCF, *PAPER_ABLATIONS, "ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES)
     ),
     "table-9": Part("gate"),
     "table-10": Part("band"),
@@ -89,7 +88,7 @@ class Reproduce(ControlGridOptions):
     def execute(self) -> None:
         """Run `ucfrec-control reproduce`."""
         # matplotlib takes half a second to import
-        from ucfrec_control.figures.figures import make_figures, make_row_figures
+        from ucfrec_control.figures.figures import draw_plans, make_figures, plan_rows
 
         part, results = PARTS[self.part], self.rows_file
         if self.show_only and part.of_runs:
@@ -121,6 +120,6 @@ class Reproduce(ControlGridOptions):
                 runs = [c.run for c in cells if c.run is not None and c.training_seed == 0]
                 files, _ = make_figures(runs, [], pictures)
             else:
-                files = make_row_figures(rows, pictures)
+                files, _ = draw_plans(plan_rows(rows), pictures)
         print("\n".join(["", *map(str, files)]))
         print(f"\nrows: {results}")

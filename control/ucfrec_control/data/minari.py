@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import minari
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
@@ -60,7 +61,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     except Exception as error:  # Minari raises arbitrary types
         raise InputError(f"{source}: an episode cannot be read ({error}); fetch it again") from None
     complete = [e for e in episodes if len(e) and (e.terminations[-1] or e.truncations[-1])]
-    observations = [_vectors(e.observations, source) for e in complete]
+    observations = [_vectors(e.observations, source, "observations") for e in complete]
     for episode, seen in zip(complete, observations, strict=True):
         if len(seen) != len(episode) + 1:
             raise InputError(
@@ -70,7 +71,8 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     spec = dataset.env_spec
     settings = {} if env_id or spec is None else spec.kwargs
     seen_before = _join([seen[:-1] for seen in observations], source, "observations")
-    actions = _join([_vectors(e.actions, source) for e in complete], source, "actions")
+    acted = [_vectors(e.actions, source, "actions") for e in complete]
+    actions = _join(acted, source, "actions")
     if complete and not is_antmaze(env_id or ""):
         # Of gymnasium-robotics, newer AntMazes have other sizes than D4RL's.
         sizes = (seen_before.shape[1], actions.shape[1])
@@ -117,7 +119,8 @@ def write_minari(trajectories: Trajectories, identifier: str) -> Path:
     folder = _root() / identifier
     if folder.exists():
         raise InputError(f"{folder} exists already; remove it or name another dataset")
-    spec = _spec(trajectories.source["env_id"])
+    env = gymnasium.Env[Any, Any]()  # of which Minari reads the specification alone
+    env.spec = _spec(trajectories.source["env_id"])
     versions = trajectories.source["versions"].items()
     unknown = trajectories.final_observations is None
     with atomic_folder(folder) as scratch, warnings.catch_warnings():
@@ -128,7 +131,7 @@ def write_minari(trajectories: Trajectories, identifier: str) -> Path:
             minari.create_dataset_from_buffers(
                 identifier,
                 _buffers(trajectories),
-                env=spec,
+                env=env,
                 observation_space=_box(trajectories.observations.shape[1]),
                 action_space=_box(trajectories.actions.shape[1]),
                 description=f"Converted by ucfrec from {trajectories.source['where']}."
@@ -206,26 +209,31 @@ def _root_is(folder: Path) -> Iterator[None]:
         os.environ.update(previous)
 
 
-def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
+def _spec(env_id: str | None) -> EnvSpec | None:
     if env_id is None:
         return None
     if is_antmaze(env_id):
         antmaze_settings(env_id)
     try:
-        return gymnasium.spec(env_id)
+        # Data does not choose what code runs: the module that a name begins with stays unread.
+        return EnvSpec(env_id) if ":" in env_id else gymnasium.spec(env_id)
     except gymnasium.error.Error as error:
-        raise InputError(f"the environment {env_id} is not known ({error}); give --env") from None
+        raise InputError(
+            f"the environment {env_id} is not known ({error}); name it with --env, your own as "
+            "MODULE:NAME"
+        ) from None
 
 
 def _box(size: int) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
-def _vectors(values: Any, source: str) -> Array:
+def _vectors(values: Any, source: str, name: str) -> Array:
     if isinstance(values, Mapping) and {"achieved_goal", "observation"} <= values.keys():
         values = np.concatenate([values["achieved_goal"], values["observation"]], axis=1)
     if not isinstance(values, np.ndarray) or values.ndim != 2:
-        raise InputError(f"{source}: its observations or actions are not vectors")
+        form = "a dict" if isinstance(values, Mapping) else f"of shape {np.shape(values)[1:]}"
+        raise InputError(f"{source}: its {name} are {form}, not vectors; convert them first")
     return values
 
 

@@ -96,7 +96,10 @@ class Trajectories:
     def __post_init__(self) -> None:
         where, n, e = self.source["where"], len(self.rewards), len(self.lengths)
         if e == 0:
-            raise InputError(f"{where}: no trajectory ends in it; it holds unfinished steps only")
+            raise InputError(
+                f"{where}: no trajectory ends in it; mark ends in terminals or timeouts (Minari: "
+                "terminations or truncations)"
+            )
         shapes = {
             "observations": (self.observations, (n, *self.observations.shape[1:2])),
             "actions": (self.actions, (n, *self.actions.shape[1:2])),

@@ -1,5 +1,6 @@
 """Tasks, their environments, and D4RL's normalised scores."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,11 +46,11 @@ def normalise(returns: npt.ArrayLike, reference: tuple[float, float]) -> Float64
     """Scores of returns of any shape: 0 for the lower return of the reference, 100 for the higher.
 
     Raises:
-        InputError: the second return of the reference is not above the first.
+        InputError: the second return of the reference is not above the first, or one is infinite.
     """
     low, high = reference
-    if not low < high:
-        raise InputError(f"--reference {low:g} {high:g}: the second return must be the higher one")
+    if not -math.inf < low < high < math.inf:
+        raise InputError(f"--reference {low:g} {high:g}: give two numbers, the higher one second")
     return 100 * (np.asarray(returns, dtype=np.float64) - low) / (high - low)
 
 

@@ -1,6 +1,6 @@
 """`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,7 @@ _REMEDY = "measure it again"
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """A figure that there seems to be data for."""
 
     kind: str
@@ -63,23 +63,14 @@ def make_figures(
     rows = [row for path in results for row in read_results(path)]
     plans = [plan for folder in runs for plan in _plan_runs(folder)]
     with damage_explained(", ".join(map(str, results)), _REMEDY):
-        plans += _plan_rows(rows)
+        plans += plan_rows(rows)
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
-    files, failed = _drawn(plans, out)
+    files, failed = draw_plans(plans, out)
     return files, [*missing, *failed]
 
 
-def make_row_figures(rows: Sequence[ResultRow], out: Path) -> list[Path]:
-    """Draw what result rows alone have the data for; returns the files written.
-
-    Args:
-        rows: of `benchmark` or `robustness`.
-    """
-    return _drawn(list(_plan_rows(rows)), out)[0]
-
-
-def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
-    """The files written, and a line for each figure that lacks its data."""
+def draw_plans(plans: Iterable[Plan], out: Path) -> tuple[list[Path], list[str]]:
+    """Draw figures into `out`; returns the files written, and a line for each that lacks data."""
     files: list[Path] = []
     missing: list[str] = []
     for plan in plans:
@@ -93,7 +84,7 @@ def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
     return files, missing
 
 
-def _plan_runs(folder: Path) -> Iterator[_Plan]:
+def _plan_runs(folder: Path) -> Iterator[Plan]:
     """Figures of the augmented episodes and of the attention of the runs in a folder."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of runs; check the path")
@@ -109,7 +100,7 @@ def _plan_runs(folder: Path) -> Iterator[_Plan]:
         dataset = control_source(record.data, file)["dataset"]
         title = f"{plots.label(method_of(record))} on {dataset}{distracted}"
         for kind in kinds:
-            yield _Plan(kind, name, partial(_draw_run, run, title, kind))
+            yield Plan(kind, name, partial(_draw_run, run, title, kind))
 
 
 def _draw_run(run: Path, title: str, kind: str) -> Figure:
@@ -125,13 +116,14 @@ def _draw_run(run: Path, title: str, kind: str) -> Figure:
     return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, title)
 
 
-def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+def plan_rows(rows: Sequence[ResultRow]) -> Iterator[Plan]:
+    """Figures of rows of `benchmark`, `robustness` and `evaluate`."""
     robustness = [row for row in rows if row.suite == ROBUSTNESS]
     cases = grouped(robustness, lambda row: (row.conditions["budget"], row.task))
     for (budget, task), case in cases.items():
         bars = [row.as_line() for row in case]
         draw = partial(plots.robustness_bars, bars, "score", "normalised score", task)
-        yield _Plan("robustness", f"{budget}-{task}", draw)
+        yield Plan("robustness", f"{budget}-{task}", draw)
     last = [row for row in rows if row.checkpoint == "last"]
     # Of several target returns the best, as the printed tables.
     tables = grouped(
@@ -141,7 +133,7 @@ def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     for (budget, table), table_rows in tables.items():
         lines = [row.as_line() for row in select_best_target(table_rows)]
         draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
-        yield _Plan("scores", f"{budget}-{table}", draw)
+        yield Plan("scores", f"{budget}-{table}", draw)
     clean = [row for row in last if not row.details.get("distractors")]
     swept = [
         row
@@ -158,4 +150,4 @@ def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
         lines = [row.as_line() for row in rows_of_family]
         if len({line["lambda_mask"] for line in lines}) > 1:
             name = f"{budget}-{family}".removesuffix("-ucf")
-            yield _Plan("lambda", name, partial(plots.lambda_curves, lines))
+            yield Plan("lambda", name, partial(plots.lambda_curves, lines))

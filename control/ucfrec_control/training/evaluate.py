@@ -102,6 +102,8 @@ def load_run(run: Path, checkpoint: str) -> Trained:
         raise InputError(
             f"{run} is of IQL or CQL, which keep their last checkpoint only; give --checkpoint last"
         )
+    if checkpoint == RETURN and not (run / "policy" / f"{RETURN}.safetensors").exists():
+        raise InputError(f"{run} has no checkpoint {RETURN}; train with --select-by-return")
     trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
     if "env_id" not in trained.record.data.others:
         raise InputError(f"{run} is not a run of `ucfrec-control train`; evaluate it with `ucfrec`")
@@ -221,7 +223,7 @@ def _row(
     seconds = time.perf_counter() - began
     returns = rolled_out.returns
     scores = None if scale is None else normalise(returns, scale)
-    low, high = bootstrap_interval(returns if scores is None else scores, seed)
+    values = returns if scores is None else scores
     conditions: dict[str, Any] = {"episodes": episodes, "distractor_fixed_to": distractor}
     conditions["lambda_mask"] = record.settings["policy"].get("lambda_mask")
     row = ResultRow(
@@ -237,7 +239,7 @@ def _row(
         data_fingerprint=record.fingerprint,
         metric="return" if scores is None else "score",
         metrics={},
-        interval=(low, high),
+        interval=bootstrap_interval(values, seed) if episodes > 1 else None,
         environment=env_id,
         target_return=None if rule is None else rule.target,
         rule=NO_TARGET if rule is None else str(rule),

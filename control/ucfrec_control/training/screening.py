@@ -289,7 +289,7 @@ def _measures(data: _Data, dimension: int, without: Collection[int]) -> bool:
         return np.asarray((alone - errors) / variance)
 
     def is_explained(shares: Float64Array) -> bool:
-        p_value = _compute_p_value(torch.from_numpy(shares), data.episodes[held_out])
+        p_value = _compute_p_value([torch.from_numpy(shares)], data.episodes[held_out])
         return bool(shares.mean() >= _MIN_EXPLAINED) and p_value < _LEVEL
 
     # The cheapest first: most dimensions fail one of these.
@@ -312,18 +312,25 @@ def _standardise(values: Tensor) -> Tensor:
     return ((values - mean) / std.masked_fill(constant, torch.inf)).clamp(-_CLIP, _CLIP)
 
 
-def _compute_p_value(differences: Tensor, episodes: IntArray) -> float:
-    """Of a mean of at most 0, one-sided, of differences (B,) of steps whose whole episodes (B,) are
-    independent."""
+def _compute_shares(pair: Tensor) -> Tensor:
+    """How much lower the second errors of a pair (2, …) are, from −1 to 1: all steps count alike,
+    where few may make up most of a difference."""
+    return (pair[0] - pair[1]) / pair.sum(0).clamp(min=1e-12)
+
+
+def _compute_p_value(measures: Sequence[Tensor], episodes: IntArray) -> float:
+    """Of a mean of at most 0, one-sided, of steps whose whole episodes (B,) are independent: the
+    lowest one of several measures (B,) of them."""
     from scipy import stats  # takes long to import
 
     _, cluster = np.unique(episodes, return_inverse=True)
-    counts = np.bincount(cluster)
-    values = differences.double().numpy()
-    residual = np.bincount(cluster, values) - counts * values.mean()
-    # Cluster-robust standard error of the mean.
-    error = np.sqrt((residual**2).sum() * len(counts) / (len(counts) - 1)) / len(values)
-    return float(stats.t.sf(values.mean() / max(error, 1e-300), len(counts) - 1))
+    counts, ratios = np.bincount(cluster), []
+    for values in (measure.double().numpy() for measure in measures):
+        residual = np.bincount(cluster, values) - counts * values.mean()
+        # Cluster-robust standard error of the mean.
+        error = np.sqrt((residual**2).sum() * len(counts) / (len(counts) - 1)) / len(values)
+        ratios.append(values.mean() / max(error, 1e-300))
+    return float(stats.t.sf(max(ratios), len(counts) - 1))
 
 
 class _Perceptrons(nn.Module):
@@ -446,10 +453,11 @@ class _Errors(NamedTuple):
             pair = self.next_state[[without, having]][:, :, helped]
             capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
             saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)
-            effect, p_value = float(saved.mean()), _compute_p_value(saved.mean(1), episodes)
-        more = self.reward[without] - self.reward[having]
-        of_reward = float(more.mean()) / data.reward_variance
-        reward_p_value = _compute_p_value(more, episodes)
+            steps = (saved.mean(1), _compute_shares(pair).mean(1))
+            effect, p_value = float(saved.mean()), _compute_p_value(steps, episodes)
+        both = self.reward[[without, having]]
+        of_reward = float((both[0] - both[1]).mean()) / data.reward_variance
+        reward_p_value = _compute_p_value((both[0] - both[1], _compute_shares(both)), episodes)
         report = DimensionReport(
             dimension, effect, tuple(helped.tolist()), p_value, of_reward, reward_p_value
         )

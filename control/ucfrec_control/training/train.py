@@ -16,7 +16,7 @@ from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.loop import SILENT, Callbacks
-from ucfrec.policies.registry import BUILT_IN, policy_names
+from ucfrec.policies.registry import BUILT_IN, policy_names, policy_package
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, read_record
@@ -131,7 +131,8 @@ def train_control(
             started with another `screening`; or no dimension would be left.
     """
     dataset_of(store)
-    entries: dict[str, Any] = {"versions": versions(PACKAGES)}
+    plugin = policy_package(config.policy_name)
+    entries: dict[str, Any] = {"versions": versions((*PACKAGES, *([plugin] if plugin else [])))}
     report = None
     if (out / RUN).exists():
         record = read_record(out)

@@ -17,12 +17,7 @@ from matplotlib.image import imsave
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.training.evaluate import (
-    choose_rule,
-    environment_of,
-    load_run,
-    open_environment,
-)
+from ucfrec_control.training.evaluate import choose_rule, environment_of, load_run, open_environment
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""

@@ -32,15 +32,12 @@ def _extend(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
     return replace(method, settings=(*method.settings, *settings), vectors=vectors)
 
 
-PEERS: Final[Mapping[str, Method]] = {
-    "gsasrec": Method("gsasrec", conditioned=False),
-}
+PEERS: Final[Mapping[str, Method]] = {"gsasrec": Method("gsasrec", conditioned=False)}
 """Strong methods of practice that are trained by gradients; items only."""
 PAPER: Final[Mapping[str, Method]] = {
     "ucf-paper": Method("ucf-paper"),
     "ucf-paper-algorithm-5": Method(
-        "ucf-paper",
-        ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0"),
+        "ucf-paper", ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
     ),
 }
 """UCF as read in the paper, with Appendix H's copies and with Algorithm 5's."""

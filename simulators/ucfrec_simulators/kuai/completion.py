@@ -212,10 +212,7 @@ def _evaluate(
 
 
 def _write(
-    store: EpisodeStore,
-    model: CompletionModel,
-    tags: Mapping[int, tuple[int, ...]],
-    folder: Path,
+    store: EpisodeStore, model: CompletionModel, tags: Mapping[int, tuple[int, ...]], folder: Path
 ) -> None:
     users, items = model.factors()
     user_ids = pq.read_table(store.path / "users.parquet").column(schema.USER_ID)

@@ -1,6 +1,5 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
-from argparse import ArgumentTypeError
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +19,7 @@ from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import chosen_rates, score_cells, settings_of
-from ucfrec_control.commands.options import ControlGridOptions, context_given
+from ucfrec_control.commands.options import ControlGridOptions
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.training.evaluate import load_run
@@ -98,13 +97,6 @@ def test_a_budget_shortens_the_papers_training_and_changes_nothing_else(size: st
         lengths = ("steps", "warmup_steps", "validate_every")
         own = {name: getattr(preset.train, name) for name in lengths}
         assert replace(config, train=replace(config.train, **own)) == preset
-
-
-@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=8.5", "ucf=9999999"])
-def test_what_is_no_context_is_refused(given: str) -> None:
-    assert context_given("ucf=20") == ("ucf", 20)
-    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
-        context_given(given)
 
 
 def test_methods_have_the_context_and_the_precision_that_are_asked_for(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.commands.reproduce import PARTS
 from ucfrec_control.data.distractor import DISTRACTORS
-from ucfrec_control.figures.figures import make_row_figures
+from ucfrec_control.figures.figures import draw_plans, plan_rows
 
 LAST = {"suite": SCORES, "metric": "score", "checkpoint": "last"}
 
@@ -60,7 +60,7 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
             for seed in range(2)
             for own in [{"training_seed": seed, "conditions": conditions}]
         ]
-        made = {file.name for file in make_row_figures(rows, tmp_path)}
+        made = {file.name for file in draw_plans(plan_rows(rows), tmp_path)[0]}
         wanted = "robustness-small-d.png" if robust else f"scores-small-{part.table}.png"
         assert wanted in made
     assert {*tmp_path.glob("lambda-*.png")} == {
@@ -73,7 +73,7 @@ def small(**conditions: object) -> dict[str, object]:
 
 
 def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -> None:
-    of = LAST | {"task": "hopper_medium-zoo"}
+    of = LAST | {"task": "d\x1b[2J\nforged"}
     rows = [
         result_row(41.5, **of, table=MAIN, method="ucf", conditions=small()),
         result_row(42.5, **of, table=MAIN, method="bc", conditions=small()),
@@ -84,6 +84,7 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -
     asked = ("--show-only", "--results", results, "--out", tmp_path / "out")
     printed = control("reproduce", "table-1", *asked)[0]
     assert [score in printed for score in ("41.5", "42.5", "43.5", "44.5")] == [True] + [False] * 3
+    assert "d\\x1b[2J forged" in printed
     assert "no rows of table-9" in refused("reproduce", "table-9", *asked)
     assert "drawn from its runs" in refused("reproduce", "figure-5", *asked)
 
@@ -97,14 +98,6 @@ def test_rows_that_lack_what_is_shown_are_one_clear_error(tmp_path: Path) -> Non
         append_rows(results, [result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)])
         said = refused(command, "--show-only", "--results", results)
         assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
-
-
-def test_names_of_foreign_rows_do_not_steer_the_terminal(tmp_path: Path) -> None:
-    results, of = tmp_path / "rows.jsonl", LAST | {"task": "d\x1b[2J\nforged"}
-    append_rows(results, [result_row(1.0, **of, conditions=small())])
-    printed = control("benchmark", "--show-only", "--results", results)[0]
-    assert "\x1b" not in printed
-    assert "d\\x1b[2J forged" in printed
 
 
 def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(tmp_path: Path) -> None:

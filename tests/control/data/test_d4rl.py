@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +281,9 @@ def test_minari_refusals(file: Path) -> None:
     refuse("not a Minari identifier", write_minari, trajectories, "no identifier")
     folder = write_minari(trajectories, mine)
     refuse("exists already", write_minari, trajectories, mine)
+    own = trajectories.source | {"env_id": "mine:Own-v0"}  # whose module is not imported
+    write_minari(replace(trajectories, source=own), "own/own-v0")
+    assert read_minari("own/own-v0").source["env_id"] == "mine:Own-v0"
     metadata = folder / "data" / "metadata.json"
     stated = metadata.read_text()
     metadata.write_text(stated.replace("observation_space", "space"))

@@ -116,8 +116,9 @@ def test_returns_are_raw_without_references(folder: Path, tmp_path: Path) -> Non
     control("evaluate", folder / "run", *EPISODES, "--reference", -900, -100, "--json", out)
     (scored,) = read_results(out)
     assert scored.value == pytest.approx((row.value + 900) / 8)
-    said = refused("evaluate", folder / "run", *EPISODES, "--reference", 5, 5)
-    assert "the second return must be the higher one" in said
+    for high in ("5", "inf"):
+        said = refused("evaluate", folder / "run", *EPISODES, "--reference", 5, high)
+        assert f"--reference 5 {high}: give two numbers, the higher one second" in said
 
 
 def test_observations_that_do_not_fit_are_refused(folder: Path) -> None:

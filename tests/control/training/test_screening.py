@@ -105,10 +105,22 @@ def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None
 
 def test_a_few_violent_steps_do_not_decide(tmp_path: Path) -> None:
     store = planted_vectors(tmp_path / "store", jolt=40.0)
-    assert screen_states(store.split("train"), FAST, seed=0).flagged == (3, 4)
-    # What they would decide: that nothing helps to predict what is jolted.
+    report = screen_states(store.split("train"), FAST, seed=0)
+    assert report.flagged == (3, 4)
+    # What they would decide: that nearly nothing helps to predict what is jolted.
     uncapped = screen_states(store.split("train"), replace(FAST, capped=0.0), seed=0)
-    assert uncapped.dimensions[0].p_value > FAST.level
+    assert uncapped.dimensions[0].effect < 0.02 < 0.08 < report.dimensions[0].effect
+
+
+def test_a_few_far_episodes_do_not_decide(tmp_path: Path) -> None:
+    """0 drives the reward alone, and 1 drives 2."""
+    rng = np.random.default_rng(0)
+    states, actions = rng.normal(size=(100, 40, 3)), rng.uniform(-1, 1, (100, 40, 1))
+    states[2::10, :, :2] *= 3
+    squares = states[:, :, :2] ** 2
+    states[:, 1:, 2] = squares[:, :-1, 1]
+    store = written(tmp_path / "store", states, actions, actions[:, :, 0] + squares[:, :, 0])
+    assert screen_states(store.split("train"), FAST, seed=0).flagged == (2,)
 
 
 def test_indicators_of_a_category_are_kept_beside_a_measurement(tmp_path: Path) -> None:

@@ -85,7 +85,8 @@ def test_data_runs_no_code(folder: Path, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "rows.json"
-    control("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
+    asked = ("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
+    assert f"\n{MADE} + distractor  dc" in control(*asked)[0]
     (row,) = read_results(out)
     assert [[*d.values()] for d in row.details["distractors"]] == [[11, 0.15, 0, False]]
     env = make_env("Hopper-v5", 2, [0.0])
@@ -104,15 +105,17 @@ def test_the_weights_of_the_highest_validation_return_are_kept(
         return Episodes(np.array([next(returns)]), np.array([1]))
 
     monkeypatch.setattr(selection, "play", play)
+    monkeypatch.setattr("ucfrec_control.training.train.policy_package", lambda name: "pytest")
     where = (folder / "store", "--out", tmp_path / "run", "--policy", "dt")
     longer = set_options((*TINY, "train.steps=6"))
     control("train", *where, *longer, "--select-by-return", 1, "--env", "Hopper-v4")
     _, about = load_tensors(tmp_path / "run" / "policy" / "return.safetensors")
     assert about == {"step": 4, "return": 5.0}
+    assert read_json(tmp_path / "run" / "run.json")["versions"]["pytest"] == pytest.__version__
     asked = ("--episodes", 1, "--checkpoint", "return", "--json", out)
     control("evaluate", tmp_path / "run", *asked)
-    assert {row.checkpoint for row in read_results(out)} == {"return"}
-    assert "return.safetensors does not exist" in refused("evaluate", folder / "store-run", *asked)
+    assert {(row.checkpoint, row.interval) for row in read_results(out)} == {("return", None)}
+    assert "train with --select-by-return" in refused("evaluate", folder / "store-run", *asked)
 
 
 def test_presets_are_those_of_the_papers() -> None:

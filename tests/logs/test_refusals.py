@@ -325,7 +325,7 @@ TABLES: dict[str, tuple[Act, str]] = {
     ),
     "repeated ids": (table_with([1, 2], [1, 2, 2, 2]), "2 of 4 rows repeat a key; keep one row"),
     "a record": (table_with([1], [1], group=[{"a": 1}]), "group. is STRUCT.* as in group.FIELD"),
-    "a time": (table_with([1], [1], available_from=[True]), "available_from. is BOOLEAN; use mil"),
+    "a time": (table_with([1], [1], available_from=[True]), "parquet: available_from .*BOOLEAN"),
     "lists": (table_with([1], [1], tags=[[["a"]]]), r"\(tags\) is VARCHAR\[\]\[\]; cast it"),
     "vectors": (
         table_with([1, 2], [1, 2], v=[np.ones(1), np.ones(2)]), "feature has lists of unequal"

@@ -54,7 +54,8 @@ def test_lists_and_names_of_sets_are_one_store(tmp_path: Path) -> None:
     assert sets.tolist() == [[0, 0, 0, 0, 1, 1], [0, 1, 2, 3, 4, 5]]
     named = log.assign(candidates=[f"0{n}" if n < 4 else "" for n in log.place])
     names = pd.DataFrame({"candidates": [f"0{n}" for n in range(4)], "items": SETS[:4]})
-    write(names, tmp_path / "sets" / "table.parquet")
+    again = names.assign(items=[items + items[:1] for items in SETS[:4]])  # the same sets
+    write(pd.concat([names, again]), tmp_path / "sets" / "table.parquet")
     (tmp_path / "map.toml").write_text("candidate_sets = ['sets/*.parquet']")
     shuffled = write(named.sample(frac=1, random_state=0), tmp_path / "named.csv")
     stores = [prepared(shuffled, tmp_path / "b", read_mapping(tmp_path / "map.toml"))]
@@ -100,7 +101,7 @@ def test_rows_beside_their_candidates_are_noted_and_bad_columns_refused(tmp_path
     with pytest.raises(InputError, match=r"candidates .*use a list of item_ids"):
         prepared(write(log.assign(candidates=0.5), tmp_path / "bad.parquet"), tmp_path / "bad")
     named = write(log.assign(candidates="a"), tmp_path / "named.parquet")
-    several, no_list = "candidates a names several", r"(DOUBLE..|BIGINT); use a list of item_ids"
+    several, no_list = "named.cand.*'a'. have several sets", r"(DOUBLE..|BIGINT); use a list of"
     for items, says in (([[3, 4], [3]], several), ([[3.0]], no_list), ([3], no_list)):
         names = pd.DataFrame({"candidates": "a", "items": items})
         write(names, tmp_path / "named.candidates.parquet")

@@ -361,19 +361,15 @@ def test_a_later_log_is_read_as_the_first_whatever_its_names(folder: Path, log: 
     pd.testing.assert_frame_equal(scored(folder, log), expected)
 
 
-def test_a_log_of_join_has_its_own_names_whatever_the_mapping_says(folder: Path) -> None:
+def test_a_log_of_join_has_its_own_names_unless_a_column_is_named(folder: Path) -> None:
     expected, mapping = scored(folder, "plain.parquet"), ["--mapping", str(folder / "shop.toml")]
     for more in ([], mapping, [*mapping, "--column", "timestamp=timestamp + position - 1"]):
         pd.testing.assert_frame_equal(scored(folder, "joined.parquet", *more), expected)
-
-
-def test_a_given_column_or_condition_wins(folder: Path) -> None:
     late = pd.read_parquet(folder / "late.parquet").assign(other=lambda frame: frame.uid + 1000)
     late.to_parquet(folder / "other.parquet")
     assert scored(folder, "other.parquet").user_id.max() < 1000
     found = scored(folder, "other.parquet", "--column", "user_id=other", "--where", "1 = 1")
-    assert found.user_id.min() >= 1000
-    assert 1007 in set(found.user_id)
+    assert found.user_id.min() >= 1000 > found.user_id.max() - 1000 > 6
 
 
 def test_a_log_with_neither_column_is_refused_with_both_names(
@@ -404,7 +400,7 @@ def test_frames_are_read_as_the_training_log(folder: Path) -> None:
     [
         (random_log().rename(columns={"user_id": "who"}), "mapping=LogMapping({'user_id': ...})"),
         (random_log().assign(user_id=0.5), "'(user_id)::BIGINT'"),
-        (random_log().assign(timestamp=True), "'seconds * 1000'"),
+        (random_log().assign(timestamp=True), "use milliseconds"),
         (random_log().assign(reward=np.nan), "reward is missing"),
     ],
 )

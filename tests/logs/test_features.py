@@ -129,10 +129,8 @@ def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
     # All sixteen of item 0 are among those that the others have too.
     assert shared(tags, 0, 1) == TAGS_PER_ITEM
     assert (tags[3] >= 0).sum() == 1
-
-
-def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
-    lists: Lists = [[f"tag {n}" for n in range(i, i + 8)] for i in range(0, 16_000, 8)]
+    # At most a thousand of a catalogue.
+    lists = [[f"tag {n}" for n in range(i, i + 8)] for i in range(0, 16_000, 8)]
     tags = tags_of([*lists, None])
     assert int(tags.max()) == DISTINCT_TAGS - 1
     assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS

@@ -184,15 +184,14 @@ def test_exposures_are_not_feedback(tmp_path: Path, capsys: pytest.CaptureFixtur
     expanded = [str(path) for path in sorted(shown.glob("*.parquet"))]
     out = ["--within", "30m", "--out", str(tmp_path / "log.parquet")]
     assert main(["join", *expanded, str(tmp_path / "clicks.csv"), *out]) == 2
-    message = capsys.readouterr().err
-    assert f"{shown / 'two.parquet'} is not feedback" in message
+    assert f"{shown / 'two.parquet'} is not feedback" in capsys.readouterr().err
     assert main(["join", str(shown / "*.parquet"), str(tmp_path / "clicks.csv"), *out]) == 0
     log = str(tmp_path / "log.parquet")
     assert main(["join", str(shown), log, *out[:-1], str(tmp_path / "again.parquet")]) == 2
     assert "log.parquet is not feedback" in capsys.readouterr().err
 
 
-def test_exposures_are_known_by_their_columns_in_any_case(tmp_path: Path) -> None:
+def test_columns_are_known_in_any_case_and_those_of_feedback_are_numbers(tmp_path: Path) -> None:
     frame = pd.read_parquet(exposures(tmp_path / "of")).rename(columns=str.upper)
     with pytest.raises(InputError, match=r"0\.parquet is not feedback"):
         joined(tmp_path, frame.drop(columns="REQUEST_ID"))
@@ -200,12 +199,9 @@ def test_exposures_are_known_by_their_columns_in_any_case(tmp_path: Path) -> Non
     feedback([(1, 10, 7, 1)]).to_parquet(clicks)
     with pytest.raises(InputError, match=r"has no column request_id, position, .* exposures"):
         join_feedback([clicks], [clicks], tmp_path / "out.parquet", MINUTE)
-
-
-def test_a_column_with_numbers_in_one_file_and_words_in_another_is_refused(tmp_path: Path) -> None:
     wanted = r"1\.csv: column CLICK has numbers in .*0\.csv, but here 1 of 2 are not numbers"
     with pytest.raises(InputError, match=wanted):
-        joined(tmp_path, csv("click", "1"), csv("CLICK", "1", "n/a"))
+        joined(tmp_path, csv("click", "1"), csv("CLICK", "1", "n/a"), shown=tmp_path / "of")
 
 
 def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
@@ -258,9 +254,7 @@ def test_one_user_who_saw_one_item_very_often_takes_no_longer(tmp_path: Path) ->
     ],
 )
 def test_feedback_at_other_times_is_told(tmp_path: Path, time: str, told: str) -> None:
-    with pytest.warns(
-        InputNote, match=r"2 of 2 rows of feedback \(100%\) match no exposure"
-    ) as notes:
+    with pytest.warns(InputNote, match=r"2 of 2 rows of .* \(100%\) match no exposure") as notes:
         joined(tmp_path, csv("click", "1", "1", time=time))
     note = str(notes[0].message)
     assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note

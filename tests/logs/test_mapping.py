@@ -105,7 +105,9 @@ def test_without_a_network_it_says_how_to_do_it_by_hand(
     assert load_release("generic", given, "sample", folder).files[0].read_bytes() == ROWS
 
 
-def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
+def test_releases_have_names_and_no_file_that_leads_out_of_the_folder(
+    tmp_path: Path,
+) -> None:
     folder, content = tmp_path / "data", archive("tar.gz", "../escaped.csv")
     folder.mkdir()
     (folder / "sample.tar.gz").write_bytes(content)
@@ -114,10 +116,6 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
         load_release("generic", given, "sample", folder)
     assert not (tmp_path / "escaped.csv").exists()
     assert not (folder / "sample").exists()
-
-
-def test_names_of_releases() -> None:
-    given = dataset("http://127.0.0.1:9/sample.zip", b"")
     assert find_release({"a": replace(given, releases={}), "b": given}, "sample") == "b"
     with pytest.raises(InputError, match="no data set is called 'x'; there are sample"):
         find_release({"b": given}, "x")

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 import warnings
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -244,7 +245,7 @@ def test_a_full_disk_leaves_nothing_behind(
 def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path) -> None:
     log = make_log().drop(columns="propensity")
     paths = [write(log.iloc[n::3], tmp_path / f"{n}.parquet") for n in range(3)]
-    write(log.iloc[1::3].assign(SESSION_ID=1, is_random=1), paths[1])
+    write(log.iloc[1::3].assign(SESSION_ID=range(220), is_random=1), paths[1])
     with pytest.warns(InputNote) as told:
         report = validate(paths, LogMapping())
     assert report["session_by"] == "gap"
@@ -269,7 +270,8 @@ def test_globs_of_a_mapping_are_relative_to_its_folder(tmp_path: Path, folder: s
 
 
 def test_ids_of_any_size_stay_apart(tmp_path: Path) -> None:
-    for first, kind in ((2**64 - 12, "uint64"), (-(2**63), "int64"), (2**53, "int64")):
+    kinds = {2**64 - 12: "uint64", 7: "uint64", -(2**63): "int64", Decimal(2**62): "object"}
+    for first, kind in kinds.items():
         ids = np.array([first + n for n in range(12)], dtype=kind)
         log = make_log()
         log["item_id"] = ids[log["item_id"]]
@@ -280,6 +282,7 @@ def test_ids_of_any_size_stay_apart(tmp_path: Path) -> None:
             prepare([path], LogMapping(item_features=(table,)), out, SMALL)
             found = pq.read_table(out / "items.parquet")["item_id"].to_pylist()
             assert sorted(map(int, found)) == ids.tolist()
+            assert isinstance(found[0], str) == (first > 2**63)
 
 
 def write_large_log(path: Path, rows: int, users: pa.Array, items: pa.Array) -> int:

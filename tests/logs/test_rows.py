@@ -150,13 +150,13 @@ def test_files_frames_and_requests_have_one_order(
     for user, each in given.groupby("user_id"):
         items = each["item_id"].to_numpy(dtype=object if "item_id" in text else np.int64)
         columns = {
-            "user": np.zeros(len(each), dtype=np.int64),
+            "user": each["user_id"].to_numpy(),
             schema.TIMESTAMP: each["timestamp"].to_numpy(),
             schema.ITEM: items,
             schema.REWARD: each["reward"].to_numpy(),
             "row": np.arange(len(each)),
         }
-        order = choose_rows(columns, "highest", user)
+        order = choose_rows(columns, "highest")
         assert [*map(str, items[order])] == expected[str(user)]
 
 
@@ -176,13 +176,13 @@ def test_the_order_says_nothing_of_the_item_nor_of_other_users() -> None:
 @pytest.mark.parametrize("duplicates", ["highest", "lowest", "first", "last"])
 def test_duplicates_among_equal_times_count_once(duplicates: str) -> None:
     rows = {
-        "user": np.zeros(4, dtype=np.int64),
+        "user": np.full(4, "user", dtype=object),
         "timestamp": np.full(4, MIDNIGHT),
         "item": np.array(["b", "a", "b", "c"], dtype=object),
         "reward": np.array([1.0, 0, 2, 0]),
         "row": np.arange(4),
     }
-    kept = choose_rows(rows, duplicates, "user")
+    kept = choose_rows(rows, duplicates)
     wanted = {"highest": 2, "lowest": 0, "first": 0, "last": 2}[duplicates]
     assert sorted(kept) == sorted([1, wanted, 3])
 

@@ -29,6 +29,9 @@ def test_only_a_longer_pause_ends_a_session(tmp_path: Path, pause: int, sessions
     # A session that ended within the gap before the end of the log may have gone on.
     path = write_log(tmp_path, np.array([0, pause]), user_id=[1, 2])
     assert validate([path], LogMapping(), options)["sessions_censored"] == 3 - sessions
+    # Rows before the one that precedes them in time are out of order.
+    path = write_log(tmp_path, np.array([3, 1, 2, 7, 7, 5]), user_id=[1, 1, 1, 2, 3, 3])
+    assert validate([path], LogMapping(), options)["unsorted_rows"] == 2
 
 
 @pytest.mark.parametrize("span", [1, 50, 10**7, 10**10])
@@ -49,6 +52,7 @@ def test_splits_begin_at_a_place_of_the_sorted_times(
 def test_a_request_is_one_decision_whatever_the_order_of_its_rows(tmp_path: Path) -> None:
     """Over a pause, with another session_id, without a position; rows without one stand alone."""
     times = np.repeat([0, 1, 2, 3, 4], [1, 1, 1, 3, 3]) * 1_800_000
+    times[[5, 6, 8]] += np.array([1_800_001, 2, 3])  # b begins before, and goes on after
     log = pd.read_parquet(write_log(tmp_path, times, item_id=range(9), session_id=range(9)))
     log["request_id"] = ["a"] * 3 + [None] * 3 + ["b"] * 3
     log["position"] = [0, 1, 2, None, None, None, 2, 1, None]
@@ -58,7 +62,9 @@ def test_a_request_is_one_decision_whatever_the_order_of_its_rows(tmp_path: Path
         log.sample(frac=1, random_state=seed).to_parquet(tmp_path / "log.parquet")
         prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / f"{seed}", options)
         stores.append(EpisodeStore.open(tmp_path / f"{seed}"))
-        assert stores[seed].column("place").tolist() == [0, 1, 2, 0, 0, 0, 0, 1, 2]
+        assert stores[seed].column("place").tolist() == [0, 1, 2, 0, 0, 0, 1, 2, 0]
+        assert stores[seed].column("item").tolist()[5:] == [7, 6, 8, 5]
+        assert (np.diff(stores[seed].column("timestamp")) >= 0).all()
         assert stores[seed].record.fingerprint == stores[0].record.fingerprint
 
 
@@ -75,12 +81,6 @@ def test_a_request_id_that_comes_again_is_another_decision(
     assert store.column("place").tolist() == [0, 1, 2] * 2
     assert store.lengths.tolist() == ([3, 3] if pause == 10**8 else [6])
     assert any("3 rows repeat" in str(note.message) for note in notes) == (pause < 10**8)
-
-
-def test_rows_before_the_one_that_precedes_them_in_time_are_out_of_order(tmp_path: Path) -> None:
-    path = write_log(tmp_path, np.array([3, 1, 2, 7, 7, 5]), user_id=[1, 1, 1, 2, 3, 3])
-    report = validate([path], LogMapping(), PrepareOptions(split=(1.0, 0.0, 0.0)))
-    assert report["unsorted_rows"] == 2
 
 
 @pytest.mark.parametrize("skew", [-50, 0, 50])
@@ -103,11 +103,12 @@ def test_the_last_rows_of_every_user_test(tmp_path: Path, last: int) -> None:
     rng = np.random.default_rng(0)
     users = np.concatenate([rng.integers(40, size=300), np.zeros(200, dtype=int)])
     parts = {"user_id": users, "item_id": rng.integers(9, size=500)}
+    parts["session_id"] = rng.integers(3, size=500)  # sessions overlap
     times = START + 60_000 * rng.permutation(500)
     log = pd.DataFrame({**parts, "timestamp": times, "reward": rng.random(500)})
     log.to_parquet(tmp_path / "log.parquet")
     split = parse_split(f"leave-last-{'out' if last == 1 else last}")
-    options = PrepareOptions(session_by="user", split=split)
+    options = PrepareOptions(session_by="user" if last == 1 else "session_id", split=split)
     prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
     found = EpisodeStore.open(tmp_path / "store").to_frame().sort_values(["user_id", "timestamp"])
     of_user = log.sort_values(["user_id", "timestamp"]).groupby("user_id").item_id

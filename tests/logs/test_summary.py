@@ -31,7 +31,8 @@ def notes_of(path: Path, mapping: LogMapping | None = None, **options: object) -
 
 def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path) -> None:
     path = write(make_log(), tmp_path / "log.csv")
-    (note,) = notes_of(path, reward="reward + REVENUE")
+    everything = LogMapping(where="(reward >= 0) + 1 > 0")
+    (note,) = notes_of(path, everything, reward="reward + REVENUE")
     assert (
         "(97%) are dropped: the reward reward + REVENUE is null because revenue is, in 3," in note
     )
@@ -107,9 +108,18 @@ def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path) ->
         assert validate([path], LogMapping(where=defined))["dropped"]["left_out"] == 50
 
 
-def test_a_log_of_a_single_item_is_told_of(tmp_path: Path) -> None:
+def test_a_log_of_a_single_item_and_parts_of_sessions_are_told_of(tmp_path: Path) -> None:
     (note,) = notes_of(write(make_log(200).assign(item_id=7), tmp_path / "log.parquet"))
     assert "all 200 rows show the same item, so there is nothing to choose between" in note
+    log = make_log(200).assign(user_id=np.arange(200) // 5, place=np.arange(200) % 5, session_id=1)
+    path = write(log, tmp_path / "log.parquet")
+    for session_by in ("gap", "session_id", "user"):
+        (note,) = notes_of(path, LogMapping(where="place IN (0, 3)"), session_by=session_by)
+        assert "80 rows that are left out are inside of sessions" in note
+        assert not notes_of(path, LogMapping(where="place < 3"), session_by=session_by)
+    days = log.assign(timestamp=log.timestamp + log.place * 10**8)
+    (note,) = notes_of(write(days, path), split=(1.0, 0.0, 0.0))
+    assert "40 of 40 sessions last longer than a day" in note
 
 
 def test_batches_give_the_moments_of_all() -> None:

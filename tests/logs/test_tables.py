@@ -225,7 +225,8 @@ def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     ("expression", "value"),
     [
         ("is_click + 2 * is_like", lambda f: f["is_click"] * 1.0 + 2 * f["is_like"]),
-        ("is_click AND is_like", lambda f: (f["is_click"] & f["is_like"]) * 1.0),
+        ("2 * (is_click AND is_like)", lambda f: (f["is_click"] & f["is_like"]) * 2.0),
+        ("is_click - (item_id > 9)", lambda f: f["is_click"] * 1.0 - (f["item_id"] > 9)),
         ("CASE WHEN is_click THEN 0.5 + is_like END", lambda f: f["is_like"] + 0.5),
         ("length('é') + length(is_click::VARCHAR)", lambda f: 6.0 - f["is_click"]),
     ],

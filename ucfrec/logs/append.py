@@ -7,6 +7,7 @@ follow. All old rows become training rows, and the newest of the new rows valida
 import hashlib
 import os
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -97,7 +98,6 @@ def append_logs(
                 f"{out} is a store of {' and of '.join(faults)}; give the same as before, or name "
                 "another folder"
             )
-        _require_held_out(str(out), remembered["appended"])
         return dict(remembered["appended"])
     old.require(store, *old.files)
     origin = str(store / StoreRecord.FILE)
@@ -391,9 +391,8 @@ def _merge_records(
     """The record of the new steps, with those of the old ones that are left."""
     lengths = [shard.lengths[shard.stays] for shard in left]
     episodes, steps = sum(map(len, lengths)), sum(int(part.sum()) for part in lengths)
-    dropped = dict(old.source.dropped)
-    for reason, rows in report["dropped"].items():
-        dropped[reason] = dropped.get(reason, 0) + rows
+    dropped = Counter(old.source.dropped)
+    dropped.update(report["dropped"])
     times = [*report["time_range_ms"]]
     for shard in left:
         of_shard = shard.load(schema.TIMESTAMP, shard.stays)

@@ -15,17 +15,11 @@ from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import bind, text_of_column, to_arrow, wrong_type
 from ucfrec.logs.mapping import LogMapping, log_files, sets_beside
-from ucfrec.logs.tables import NOTHING, is_integer, open_tables
+from ucfrec.logs.tables import NOTHING, first_and_more, is_integer, open_tables
 from ucfrec.logs.typed import KEY_OF_LIST, TypedLog
 
 ITEMS = "items"
 """Column of a table of sets: the ids in a set, whose name is in the column `candidates`."""
-
-_SETS = (
-    f"SELECT {schema.CANDIDATES}, CAST(any_value({ITEMS}) AS VARCHAR[]) AS {ITEMS} FROM "
-    f"(SELECT {{}} AS {schema.CANDIDATES}, {{}} AS {ITEMS} FROM {{}}) GROUP BY {schema.CANDIDATES}"
-)
-"""SQL of the sets in a relation, by the SQL of their names and of their lists."""
 
 
 def name_set(candidates: Array | None) -> str:
@@ -60,7 +54,7 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     if not n_codes:
         return None
     connection.register("older_sets", pa.record_batch([*map(to_arrow, older)], ["number", "item"]))
-    connection.execute(f"CREATE TABLE named_sets AS {_select_sets(log)}")
+    _load_sets_of(log)
     unnamed, example = log.one(
         f"SELECT count(*), min({schema.CANDIDATES}) FROM candidate_codes "
         f"ANTI JOIN named_sets USING ({schema.CANDIDATES})"
@@ -68,8 +62,9 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     if unnamed:
         raise InputError(
             f"{log.name}: {unnamed:,} sets that {schema.CANDIDATES} names (such as {example!r:.60})"
-            " are in no table; name the tables of sets in the mapping (candidate_sets), or ignore "
-            f"the column with --column {schema.CANDIDATES}="
+            " are in no table; name the tables of sets in the mapping (candidate_sets), read text "
+            f"of lists with --column {schema.CANDIDATES}='COLUMN::VARCHAR[]', or ignore the column "
+            f"with --column {schema.CANDIDATES}="
         )
     n_older = int(older[0].max(initial=-1)) + 1
     connection.execute(f"""
@@ -102,24 +97,29 @@ def number_sets(log: TypedLog, older: IntArray) -> tuple[IntArray, IntArray] | N
     return numbers, np.hstack([older, np.stack([added["number"], added["item"]])])
 
 
-def _select_sets(log: TypedLog) -> str:
-    """SQL of the sets that a log holds in lists or names: `candidates` as in its rows, `items`."""
+def _load_sets_of(log: TypedLog) -> None:
+    """Create the table `named_sets` of the sets that a log holds in lists or names."""
     connection, lists = log.connection, []
     for table in log.tables:
         text = text_of_column(connection, table, log.mapping, schema.CANDIDATES)
         value = bind(connection, table, f"for {schema.CANDIDATES}", text)
         if value.kind.endswith("[]") and NOTHING not in value.kind:
-            lists.append(_SETS.format(KEY_OF_LIST.format(value.sql), value.sql, table.sql))
+            lists.append(
+                f"SELECT {KEY_OF_LIST.format(value.sql)} AS {schema.CANDIDATES}, "
+                f"CAST(any_value({value.sql}) AS VARCHAR[]) AS {ITEMS} FROM {table.sql} GROUP BY 1"
+            )
     files = [file for table in log.tables for file in table.files]
-    return select_named_sets(connection, list_set_files(log.mapping, files), lists)
+    load_named_sets(connection, list_set_files(log.mapping, files), lists)
 
 
-def select_named_sets(
+def load_named_sets(
     connection: duckdb.DuckDBPyConnection, files: Sequence[Path], lists: Sequence[str] = ()
-) -> str:
-    """SQL of the sets in tables of sets and in `lists`, each once: `candidates`, the name as text,
-    and `items`, a list of text. Raises InputError if a table lacks these columns."""
-    every = [*lists, _SETS.format("CAST(NULL AS VARCHAR)", "CAST([] AS VARCHAR[])", "range(0)")]
+) -> None:
+    """Create the table `named_sets` of the sets in tables of sets and in `lists` (SQL), each once:
+    `candidates`, the name as text, and `items`, a list of text. Raises InputError if a table lacks
+    these columns, or a name has several sets."""
+    none = f"SELECT '' AS {schema.CANDIDATES}, CAST([] AS VARCHAR[]) AS {ITEMS} WHERE false"
+    every = [none, *lists]
     for table in open_tables(connection, files) if files else ():
         name, ids = (bind(connection, table, "of sets", n) for n in (schema.CANDIDATES, ITEMS))
         kind, _, is_list = ids.kind.partition("[")
@@ -127,10 +127,18 @@ def select_named_sets(
             raise wrong_type(table, "of sets", ITEMS, ids.kind, "use a list of item_ids")
         columns = f"CAST({name.sql} AS VARCHAR), CAST({ids.sql} AS VARCHAR[])"
         every.append(f"SELECT {columns} FROM {table.sql}")
-    several, rows = f"count(DISTINCT list_sort({ITEMS})) > 1", " UNION ALL ".join(every)
-    fault = f"error('{schema.CANDIDATES} ' || {schema.CANDIDATES} || ' names several sets')"
-    value = f"CASE WHEN {several} THEN {fault} ELSE any_value({ITEMS}) END AS {ITEMS}"
-    return f"SELECT {schema.CANDIDATES}, {value} FROM ({rows}) GROUP BY {schema.CANDIDATES}"
+    connection.execute(
+        f"CREATE TABLE named_sets AS SELECT {schema.CANDIDATES}, any_value({ITEMS}) AS {ITEMS}, "
+        f"count(DISTINCT list_sort(list_distinct({ITEMS}))) > 1 AS differ "
+        f"FROM ({' UNION ALL '.join(every)}) GROUP BY {schema.CANDIDATES}"
+    )
+    names = f"SELECT count(*), min({schema.CANDIDATES}) FROM named_sets WHERE differ"
+    ((count, example),) = connection.sql(names).fetchall()
+    if count:
+        raise InputError(
+            f"{first_and_more(files)}: {count:,} names of {schema.CANDIDATES} (such as "
+            f"{example!r:.60}) have several sets; give every set a name of its own"
+        )
 
 
 def write_sets(log: Path, sets: pa.Table) -> None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -55,7 +56,6 @@ _OF_JOIN = (
     *(schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, schema.CANDIDATES),
 )
 """Log columns that logs of `join` have."""
-_NAME = re.compile(r"[^\W\d]\w*")
 _OF_ENGINE = re.compile(r"[A-Z][A-Za-z ]+ Error: ")
 _DISK_FULL = ("No space left", "quota exceeded", "File too large", "max_temp_dir", "requested and")
 """In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
@@ -78,9 +78,8 @@ def engine(
     """
     with scratch_folder(folder.absolute(), "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
-        # In the name of a database, DuckDB reads "?" and "\\" as those of an address.
-        usual = work is not None and not {*"?\\"} & {*str(work)}
-        database = f"{work}/rows.duckdb" if usual else ":memory:"
+        # In the name of a database, DuckDB reads "?" as that of an address.
+        database = f"{work}/rows.duckdb" if work and "?" not in str(work) else ":memory:"
         connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:
@@ -143,8 +142,9 @@ def anonymous_bytes(process: int | None = None) -> int:
 def bytes_of(size: str) -> int | None:
     """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
-    power = (1024 if match and match[3] else 1000) ** " kmgt".index((match and match[2]) or " ")
-    return int(float(match[1]) * power) if match else None
+    if match is None:
+        return None
+    return int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
 
 
 def to_numpy(column: "pa.Array") -> Array:
@@ -193,7 +193,7 @@ def bind(
     if expression.casefold() in names:
         name = names[expression.casefold()]
         return Bound(quote_name(name), columns[name], (name,), True)
-    if _NAME.fullmatch(expression):
+    if expression.isidentifier():
         raise _missing(table, what, expression)
     try:
         # DuckDB would read some names that are not columns as the current user or time.
@@ -207,11 +207,9 @@ def bind(
         try:
             kind = _find_type(connection, sql, types)
         except duckdb.BinderException:
-            truth = {name for name, kind in types.items() if kind == "BOOLEAN"}
-            if not truth:
-                raise
-            sql = f"({cast_truth_values(connection, expression, truth)}\n)"
-            kind = _find_type(connection, sql, types)
+            find_type = partial(_find_type, connection, columns=types)
+            sql = f"({cast_truth_values(connection, expression, find_type)})"
+            kind = find_type(sql)
     except (duckdb.Error, NotScalarError) as error:
         raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
     return Bound(sql, kind, tuple(types), False)
@@ -237,6 +235,8 @@ def wrong_type(
     remedy: str,
 ) -> InputError:
     """Error for a column of an unsupported type."""
+    if kind.startswith("STRUCT") and kind.endswith(")"):
+        remedy = f"name one of its fields, as in {expression}.FIELD"
     return InputError(f"{table.files[0]}: {what} ({expression}) is {kind}; {remedy}")
 
 

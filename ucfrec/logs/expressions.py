@@ -7,7 +7,7 @@ tree) and every node of the tree must be of a kind listed here.
 
 import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Self
 
@@ -81,6 +81,8 @@ _OPERATORS = """
 """
 FUNCTIONS = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATORS)).split())
 """Allowed functions, and operators by the parser's names (~~ is LIKE)."""
+_COMPUTING = frozenset(f"{_MATHS} + - * / // % ^ **".split())
+"""Functions whose arguments are numbers."""
 COPYING = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
 """Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
 _JOINING = ("concat", "||", "list_concat", "list_cat", "list_append", "list_prepend")
@@ -101,8 +103,7 @@ _ALLOWED = (
     "allowed are columns, literals, operators, casts, CASE, and the functions that "
     "docs/log-format.md lists"
 )
-
-
+_Node = dict[str, Any]
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} levels deep; simplify it"
 _TOO_LARGE = f"it is too large; nest fewer of CASE x WHEN, {', '.join(sorted(COPYING))}"
 
@@ -182,26 +183,44 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
 
 
 def cast_truth_values(
-    connection: "duckdb.DuckDBPyConnection", expression: str, columns: Collection[str]
+    connection: "duckdb.DuckDBPyConnection", expression: str, find_type: Callable[[str], str]
 ) -> str:
-    """An allowed expression with 0 and 1 in place of the truth values of some columns."""
+    """An allowed expression with 0 and 1 in place of the truth values that it computes with;
+    `find_type` returns the DuckDB type of an expression over its columns."""
+    whole = _parse(connection, "CAST(1 AS BIGINT)")
+    values = whole["statements"][0]["node"]["select_list"]
+    (cast,) = values
+
+    def cast_if_true_or_false(node: _Node) -> _Node:
+        return {**cast, "child": node} if find_type(write(node)) == "BOOLEAN" else node
+
+    def write(node: _Node) -> str:
+        values[:] = [node]
+        query = "SELECT json_deserialize_sql(?::JSON)"
+        (text,) = connection.execute(query, [json.dumps(whole)]).fetchall()[0]
+        return str(text).removeprefix("SELECT ")
+
+    def change(node: _Node) -> _Node:
+        if node.get("class") == "FUNCTION" and node["function_name"] in _COMPUTING:
+            for argument in node["arguments"]:
+                argument["expression"] = cast_if_true_or_false(argument["expression"])
+        return cast_if_true_or_false(node) if node.get("class") == "COLUMN_REF" else node
+
+    tree = _parse(connection, f"{expression}\n", change)
+    return write(tree["statements"][0]["node"]["select_list"][0])
+
+
+def _parse(
+    connection: "duckdb.DuckDBPyConnection",
+    expression: str,
+    change: Callable[[_Node], Any] | None = None,
+) -> Any:
+    """Syntax tree of `SELECT expression`, with each node as `change` returns it."""
     query = "SELECT json_serialize_sql(?)"
-    (tree,) = connection.execute(query, [f"SELECT {expression}\n"]).fetchall()[0]
-    text, folded = f"SELECT {expression}".encode(), {name.casefold() for name in columns}
-    # Places are in bytes; from the last one, those before it stay as they are.
-    for begin, length, name in sorted(_references(json.loads(tree)), reverse=True):
-        if name.casefold() in folded:
-            column = text[begin : begin + length]
-            text = text[:begin] + b"CAST(" + column + b" AS BIGINT)" + text[begin + length :]
-    return text.decode().removeprefix("SELECT ")
-
-
-def _references(tree: Any) -> Iterator[tuple[int, int, str]]:
-    """Begin, length and name of each column of a syntax tree."""
-    if isinstance(tree, dict) and tree.get("class") == "COLUMN_REF":
-        yield tree["query_location"], tree["query_location_length"], tree["column_names"][0]
-    for part in _parts(tree):
-        yield from _references(part)
+    (tree,) = connection.execute(query, [f"SELECT {expression}"]).fetchall()[0]
+    if len(tree) > _MAX_TREE:
+        raise NotScalarError(_TOO_LARGE)
+    return json.loads(tree, object_hook=change)
 
 
 def _parts(tree: Any) -> Collection[Any]:
@@ -211,22 +230,16 @@ def _parts(tree: Any) -> Collection[Any]:
     return tree if isinstance(tree, list) else ()
 
 
-def _select(
-    connection: "duckdb.DuckDBPyConnection", expression: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def _select(connection: "duckdb.DuckDBPyConnection", expression: str) -> tuple[_Node, _Node]:
     """Syntax trees of `SELECT expression`: the query without its value, and the value; without
     places in the text, so that equal expressions have equal trees."""
     from duckdb import Error
 
-    def drop_places(node: dict[str, Any]) -> dict[str, Any]:
+    def drop_places(node: _Node) -> _Node:
         return {name: part for name, part in node.items() if name not in _PLACES}
 
     try:
-        query = "SELECT json_serialize_sql(?)"
-        (tree,) = connection.execute(query, [f"SELECT {expression}"]).fetchall()[0]
-        if len(tree) > _MAX_TREE:
-            raise NotScalarError(_TOO_LARGE)
-        parsed = json.loads(tree, object_hook=drop_places)
+        parsed = _parse(connection, expression, drop_places)
     except RecursionError:
         raise NotScalarError(_TOO_DEEP) from None
     except (Error, UnicodeError) as error:
@@ -286,7 +299,7 @@ def _growth(tree: Any) -> int:
     return max(grown) * (_QUOTES if name in _QUOTING else 1)
 
 
-def _require_listed(node: dict[str, Any]) -> None:
+def _require_listed(node: _Node) -> None:
     """Refuse a node of a kind, type or function that is not allowed."""
     kind = node["class"]
     if kind not in _NODES:
@@ -307,7 +320,7 @@ def _require_listed(node: dict[str, Any]) -> None:
             raise NotScalarError(f"it calls {_quote(name)} as an aggregate or with named arguments")
 
 
-def _is_qualified(node: dict[str, Any]) -> bool:
+def _is_qualified(node: _Node) -> bool:
     return bool(node["catalog"] or node["schema"] or len(node["qualified_name"]["path"]) != 1)
 
 

@@ -18,11 +18,13 @@ from ucfrec.logs.candidates import number_sets
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
 from ucfrec.logs.sessions import ID_TABLES
+from ucfrec.logs.summary import MANY
 from ucfrec.logs.tables import (
     NOTHING,
     PANDAS_INDEX,
     WHOLE,
     Table,
+    cast_integer,
     cast_timestamp,
     first_and_more,
     is_integer,
@@ -32,7 +34,7 @@ from ucfrec.logs.tables import (
     quote_name,
     raw_name,
 )
-from ucfrec.logs.typed import TypedLog, cast_value
+from ucfrec.logs.typed import AVAILABLE, TypedLog, cast_value
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -44,13 +46,6 @@ CATEGORIES = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
-_TIMES = ("available_from", "available_until")
-_MANY_LACKING = 0.2
-"""Share of the ids without a row above which a note says so."""
-
-
-_Types = dict[str, tuple[str, Path]]
-"""Feature of a table, without regard to case, to its type and the first file that has it."""
 
 
 def load_features(
@@ -68,7 +63,8 @@ def load_features(
     """
     names = [f"{kind}_features_{number}" for number in range(len(tables))]
     for name, table in zip(names, tables, strict=True):
-        opened, types = open_tables(connection, log_files(table.files)), _Types()
+        opened = open_tables(connection, log_files(table.files))
+        types: dict[str, tuple[str, Path]] = {}
         parts = [_select_part(connection, part, table, kind, id_type, types) for part in opened]
         values = [
             f"CAST(f{n} AS {'VARCHAR' if type_ == NOTHING else type_}) AS f{n}"
@@ -76,7 +72,7 @@ def load_features(
         ]
         rows = f"({' UNION ALL BY NAME '.join(parts)})"
         with explain_errors(connection, opened):
-            times = [time for time in connection.sql(f"FROM {rows}").columns if time in _TIMES]
+            times = [time for time in connection.sql(f"FROM {rows}").columns if time in AVAILABLE]
             columns = ", ".join(["id", *values, *times])
             connection.execute(
                 f"CREATE TABLE {name} AS SELECT {columns} FROM {rows} WHERE id IS NOT NULL"
@@ -95,7 +91,7 @@ def load_features(
 
 def _split_times(connection: duckdb.DuckDBPyConnection, name: str, table: FeatureTable) -> None:
     """Move the times of a feature table to a table of their own, which may repeat an id."""
-    begin, until = _TIMES
+    begin, until = AVAILABLE
     connection.execute(
         f"CREATE TABLE {name}_times AS SELECT DISTINCT id, {begin}, {until} FROM {name}"
     )
@@ -136,7 +132,7 @@ def read_offers(
     from ucfrec.episodes.offers import Offers  # imports torch
 
     intervals, sets = (np.zeros((rows, 0), dtype=np.int64) for rows in (3, 2))
-    begin, until = (f"coalesce({name}, {n})" for name, n in zip(_TIMES, ALWAYS, strict=True))
+    begin, until = (f"coalesce({name}, {n})" for name, n in zip(AVAILABLE, ALWAYS, strict=True))
     for name in tables:
         rows = connection.sql(
             f"SELECT number::BIGINT, {begin}, {until} "
@@ -170,9 +166,10 @@ def _select_part(
     table: FeatureTable,
     kind: str,
     id_type: str,
-    types: _Types,
+    types: dict[str, tuple[str, Path]],
 ) -> str:
-    """SQL of a part's rows: `id`, and its features, which are added to `types`, as `f0`, …."""
+    """SQL of a part's rows: `id`, and its features as `f0`, …, which are added to `types`: name in
+    lower case to type and the first file that has it."""
     key = bind(connection, opened, f"key of {kind} features", table.key)
     times = _bind_times(connection, opened, table, kind)
     key_columns = {name.casefold() for bound in (key, *times.values()) for name in bound.columns}
@@ -212,7 +209,7 @@ def _select_part(
     columns = (column for source in (*sources, *times.values()) for column in source.columns)
     narrow = opened.of(columns, raw)
     for name, time in times.items():
-        sql, _ = cast_value(connection, narrow, schema.TIMESTAMP, name, time, None)
+        sql, _ = cast_value(connection, narrow, name, getattr(table, name) or name, time, None)
         has_text = f"trim(CAST({time.sql} AS VARCHAR)) NOT IN ('', 'nan')"
         # Seconds since 1970, read as milliseconds, are of its first weeks.
         faulty = f"{has_text} AND ({sql}) IS NULL OR ({sql}) BETWEEN 100_000_000 AND 4_000_000_000"
@@ -234,7 +231,7 @@ def _bind_times(
     if kind != schema.ITEM_ID:
         return {}
     columns = {name.casefold() for name in opened.columns}
-    texts = {name: getattr(table, name) or (name if name in columns else "") for name in _TIMES}
+    texts = {name: getattr(table, name) or (name if name in columns else "") for name in AVAILABLE}
     if not any(texts.values()):
         return {}
     return {
@@ -256,7 +253,7 @@ def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
         return f"CAST({sql} AS VARCHAR)", "VARCHAR"
     if is_vector(kind) and not is_integer(kind.partition("[")[0]):
         return f"CAST({sql} AS FLOAT[])", "FLOAT[]"
-    if kind.endswith("[]"):
+    if kind.endswith("]") and "][" not in kind and not kind.startswith(("STRUCT", "MAP")):
         return f"CAST({sql} AS VARCHAR[])", "VARCHAR[]"
     return None
 
@@ -268,9 +265,7 @@ def _cast_id(key: str, key_type: str, id_type: str) -> str:
         exact = f"AND abs({key}) < {WHOLE[key_type]}" if key_type in WHOLE else ""
         key = f"CASE WHEN {key} = trunc({key}) {exact} THEN TRY_CAST({key} AS HUGEINT) END"
     elif id_type == "BIGINT" and not is_integer(key_type):
-        # Text is an integer only if it is written as the integer is: 007 is not 7.
-        number = f"TRY_CAST({key} AS BIGINT)"
-        return f"CASE WHEN CAST({number} AS VARCHAR) = CAST({key} AS VARCHAR) THEN {number} END"
+        return cast_integer(key)
     as_id = f"TRY_CAST({key} AS {id_type})"
     # Text without a character is missing, as in the log.
     return as_id if id_type == "BIGINT" else f"nullif({as_id}, '')"
@@ -305,19 +300,17 @@ def require_known_ids(
     used_ids = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
     for table, name in zip(tables, names, strict=True):
         if not _count(connection, f"{used_ids} SEMI JOIN {name} ON id = {kind}"):
-            ids, log_ids = (
-                connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
-                for column, rows in (("id", name), (kind, used_ids))
-            )
-            keys = f"is {_list_values(ids)}" if ids else "is never such an id"
+            ids = _list_examples(connection, "id", name)
+            keys = f"is {ids}, …" if ids else "is never such an id"
+            log_ids = _list_examples(connection, kind, used_ids)
             raise InputError(
                 f"{', '.join(map(str, table.files))}: no row belongs to a {kind} of the log, which "
-                f"are {_list_values(log_ids)}, and {table.key} {keys}; let the key be an "
+                f"are {log_ids}, …, and {table.key} {keys}; let the key be an "
                 "expression that gives the same ids, or leave the file out"
             )
     if noted:
         which = f"{kind}s of the log"
-        note_lacking(connection, tables, names, kind, used_ids, which, _MANY_LACKING)
+        note_lacking(connection, tables, names, kind, used_ids, which, MANY)
 
 
 def note_lacking(
@@ -345,8 +338,9 @@ def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
     return int(count)
 
 
-def _list_values(rows: Sequence[tuple[object, ...]]) -> str:
-    return ", ".join([*(f"{value!r:.40}" for (value,) in rows), "…"])
+def _list_examples(connection: duckdb.DuckDBPyConnection, column: str, rows: str) -> str:
+    values = connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
+    return ", ".join(f"{value!r:.40}" for (value,) in values)
 
 
 @dataclass(frozen=True)

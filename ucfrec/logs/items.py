@@ -73,13 +73,11 @@ def write_item_states(
     """Learn and write the item embeddings (at most `size` dimensions) and user features of the
     store at `folder`. Where all rewards of the training split are equal, all are high."""
     shards = range(StoreRecord.read(folder).n_shards)
-    moments, low, highest = Moments(1), np.inf, -np.inf
+    moments = Moments(1)
     for batch in read_training_steps(folder, shards):
-        rewards = batch[schema.REWARD]
-        moments.add(rewards)
-        low = min(low, float(rewards.min(initial=np.inf)))
-        highest = max(highest, float(rewards.max(initial=-np.inf)))
-    high = min(highest, float(moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])))
+        moments.add(batch[schema.REWARD])
+    low, usual = moments.lowest[0], moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])
+    high = min(moments.highest[0], usual)
     low = low if low < high else high - 1
     matrix = Exposure(scratch / "exposure.bin", encoded.item_counts)
     for batch in keep_users_whole(read_training_steps(folder, shards), schema.USER):

@@ -11,7 +11,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.parquet import require_table_names, table_writer
-from ucfrec.logs.candidates import list_set_files, select_named_sets, write_sets
+from ucfrec.logs.candidates import ITEMS, list_set_files, load_named_sets, write_sets
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.rows import DAY_MS, DECISION_MS
@@ -20,12 +20,12 @@ from ucfrec.logs.tables import (
     EXPOSED,
     PANDAS_INDEX,
     Table,
-    first_and_more,
+    cast_integer,
     is_number,
     open_tables,
     quote_name,
 )
-from ucfrec.logs.typed import WANTED, LogTables, type_columns
+from ucfrec.logs.typed import WANTED, LogTables, TypedLog, type_columns
 
 FEEDBACK = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
@@ -137,8 +137,9 @@ def join_feedback(
                 for request, missing in ((_REQUEST, "NOT NULL"), (f"NULL AS {_REQUEST}", "NULL"))
             )
             connection.execute(f"CREATE TABLE matches AS {' UNION ALL '.join(matches)}")
+            load_named_sets(connection, set_files)
             sets = connection.sql(
-                f"FROM ({select_named_sets(connection, set_files)}) "
+                f"SELECT {schema.CANDIDATES}, {ITEMS} FROM named_sets "
                 f"SEMI JOIN exposures USING ({schema.CANDIDATES}) ORDER BY {schema.CANDIDATES}"
             )
             write_sets(out, sets.to_arrow_table())
@@ -238,7 +239,7 @@ def _make_feedback(
         ).columns
     }
     keys |= {name.casefold() for table in tables for name, _ in table.partitions}
-    columns = _feedback_columns(connection, tables, keys)
+    columns = _feedback_columns(typed, tables, keys)
     selects, folded = [], [name.casefold() for name in columns]
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
         names = _names_of(whole)
@@ -254,21 +255,20 @@ def _make_feedback(
         source = narrow.add_texts(present.values(), requests)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     conditions = ["true"]
+    rows = f"({' UNION ALL BY NAME '.join(selects)})"
     if mapping.where is not None:
-        note_undefined(connection, tables, mapping.where)
+        note_undefined(typed, mapping.where, rows)
         conditions.append(WANTED)
     if mapping.earliest is not None:
         conditions.append(f"timestamp >= {int(mapping.earliest_ms)}")
     connection.execute(
         "CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row "
-        f"FROM ({' UNION ALL BY NAME '.join(selects)}) WHERE {' AND '.join(conditions)}"
+        f"FROM {rows} WHERE {' AND '.join(conditions)}"
     )
     return columns
 
 
-def _feedback_columns(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
-) -> tuple[str, ...]:
+def _feedback_columns(log: TypedLog, tables: Sequence[Table], keys: set[str]) -> tuple[str, ...]:
     """Numeric and boolean columns but `keys` (in lower case), with a note on those left out."""
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
@@ -289,11 +289,11 @@ def _feedback_columns(
     for table, key, name, kind in not_numbers:
         if key not in columns and kind != "VARCHAR":
             continue
-        ((values, words, sample),) = connection.sql(
+        values, words, sample = log.one(
             "SELECT count(x), count(x) FILTER (n), min(x) FILTER (n) FROM (SELECT x, "
             "NOT coalesce(isfinite(TRY_CAST(x AS DOUBLE)), false) AS n FROM (SELECT "
             f"trim(CAST({quote_name(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
-        ).fetchall()
+        )
         found_words = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
         if words and key in columns:
             raise InputError(
@@ -303,11 +303,10 @@ def _feedback_columns(
         if values and key not in columns:
             left_out[name] = f"text, {found_words if words else 'though all are numbers'}"
     if left_out:
-        files = first_and_more([file for table in tables for file in table.files])
         names = ", ".join(f"{name} ({why})" for name, why in left_out.items())
         warn_user(
-            f"{files}: columns are left out: {names}; where one is feedback, {_WRITE_NUMBERS}, in "
-            "a column of its own name"
+            f"{log.name}: columns are left out: {names}; where one is feedback, {_WRITE_NUMBERS}, "
+            "in a column of its own name"
         )
     return tuple(name for name, _ in columns.values())
 
@@ -345,8 +344,7 @@ def _write(
     internal = "user_id", "row", *values.values(), *earlier.values()
     ((whole,),) = connection.sql(
         "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
-        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
-        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
+        f"AND (SELECT count({cast_integer('user_id')}) = count(user_id) FROM exposures)"
     ).fetchall()
     user = "CAST(user_id AS BIGINT) AS user_id" if whole else "user_id"
     query = (

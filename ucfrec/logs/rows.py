@@ -121,8 +121,8 @@ class RowFile:
         """Some columns of the batches, or all, in order."""
         for number, batch in enumerate(self._batches):
             if self._folder is not None:
-                files = {name: self._folder / f"{number}-{name}.npy" for name in names or batch}
-                batch = {name: np.load(file) for name, file in files.items()}
+                begin = f"{self._folder}/{number}"
+                batch = {name: np.load(f"{begin}-{name}.npy") for name in names or batch}
             yield batch
 
 
@@ -176,7 +176,7 @@ class SortedRows:
             winners = np.arange(len(repeated)) - _count_since(~repeated)
             rewards = batch[schema.REWARD]
             lost, counted = rewards[repeated], rewards[winners[repeated]]
-            equal = (lost == counted) | (np.isnan(lost) & np.isnan(counted))
+            equal = np.isclose(lost, counted, rtol=0, atol=0, equal_nan=True)
             self.conflicts += int(np.count_nonzero(~equal))
             self.dropped["duplicate"] += len(lost)
         undefined = np.isnan(batch[schema.REWARD]) & ~repeated
@@ -202,10 +202,7 @@ class SortedRows:
             # Rows without a request stay in the order of their hashes.
             alone = batch[_REQUEST] < 0
             batch[_REQUEST] = np.where(alone, np.arange(-len(alone), 0), batch[_REQUEST])
-        list_keys = [batch[n] for n in (schema.POSITION, _REQUEST) if n in batch]
-        if list_keys:
-            order = np.lexsort([*list_keys, times, batch[USER]])
-            batch = take_rows(batch, order)
+            batch = take_rows(batch, _order_requests(batch))
             times = batch[schema.TIMESTAMP]
         if by_session:
             users, sessions = batch[USER], batch[SESSION]
@@ -237,6 +234,17 @@ class SortedRows:
         return take_rows(batch, source)
 
 
+def _order_requests(batch: dict[str, Array]) -> IntArray:
+    """Rows by the time at which their request begins: rows of others may be between its own."""
+    users, requests, times = (batch[name] for name in (USER, _REQUEST, schema.TIMESTAMP))
+    order = np.lexsort((times, requests, users))
+    users, requests, times = users[order], requests[order], times[order]
+    same = _equal_before(users) & _equal_before(requests)
+    begins = np.append(True, ~same | (np.diff(times) > DECISION_MS))
+    starts = times[begins][np.cumsum(begins) - 1]
+    return order[np.lexsort((requests, starts, users))]
+
+
 def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str, Array], int]:
     """Rows in order, with their places in their decisions instead of requests and positions, and
     how many repeat a position of their decision, with which another one begins."""
@@ -251,16 +259,17 @@ def _place_in_lists(batch: dict[str, Array], by_session: bool) -> tuple[dict[str
     if positions is not None:
         decisions = np.cumsum(begins)
         # Rows without a position repeat none. Complex numbers sort by their real parts first.
-        positions = np.where(np.isfinite(positions), positions, -0.5 - np.arange(len(times)))
-        keys = decisions + 1j * positions
+        alone = -0.5 - np.arange(len(times))
+        keys = decisions + 1j * np.where(np.isfinite(positions), positions, alone)
         order = keys.argsort(kind="stable")
         first = np.append(True, ~_equal_before(keys[order]))
         if repeated := int((~first).sum()):
             occurrences = _count_since(first)[order.argsort()]
             order = np.lexsort((occurrences, times, decisions))
-            batch = take_rows(batch, order)
+            batch, positions = take_rows(batch, order), positions[order]
             lists = np.maximum.accumulate((decisions * len(times) + occurrences)[order])
             begins = np.append(True, ~_equal_before(lists))
+        batch = take_rows(batch, np.lexsort((positions, np.cumsum(begins))))
     return {**batch, schema.PLACE: _count_since(begins).astype("<i4")}, repeated
 
 
@@ -349,12 +358,10 @@ def mark_faults(
 ) -> str:
     """SQL of typed rows with `fault`: 0, or the number of the first, from 1. Actions get a hash.
     Items not in `known_items`, of a store, are a fault; with `any_held`, also rows of `HELD`."""
-    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
-    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS
-    conditions = {"left_out": f"NOT {WANTED}"} if log.mapping.where is not None else {}
+    conditions = {"left_out": f"{WANTED} IS NOT TRUE"} if log.mapping.where is not None else {}
     conditions |= {
-        "null_key": " OR ".join(f"{key} IS NULL" for key in keys if key != schema.ACTION),
+        "null_key": " OR ".join(f"{key} IS NULL" for key in log.required if key != schema.ACTION),
         "clock_out_of_range": f"timestamp NOT BETWEEN {log.mapping.earliest_ms} AND {latest}",
     }
     if log.mapping.before_ms is not None:
@@ -462,19 +469,17 @@ def check_sorted(
     return rows
 
 
-def choose_rows(
-    rows: Mapping[str, Array], duplicates: str, user_id: int | str | None = None
-) -> IntArray:
+def choose_rows(rows: Mapping[str, Array], duplicates: str) -> IntArray:
     """(K,) positions of the rows of a log in memory that count, in order of user and time.
 
     `order_rows` and `SortedRows.add` do the same for logs of any size. `rows` are (N,) columns in
-    any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row` (position in the log) and
-    perhaps those of `order_duplicates`; `user_id` the only user, if `user` holds no identifiers.
+    any order: `user`, `item` (identifiers), `timestamp`, `reward`, `row` (position in the log) and
+    perhaps those of `order_duplicates`.
     """
     users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
     order = np.lexsort((times, users))
-    apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
+    apart = ~(_equal_before(times[order]) & _equal_before(users[order]))
     if apart.all():
         return order[finite[order]]
     tied = np.zeros(len(users), dtype=bool)
@@ -483,12 +488,12 @@ def choose_rows(
     items, ties = np.zeros((2, len(users)), dtype=np.int64)
     ids, items[tied] = np.unique(rows[schema.ITEM][tied], return_inverse=True)
     names, places = np.unique(users[tied], return_inverse=True)
-    of_users = hash_ids([user_id] * len(names) if user_id is not None else names.tolist())[places]
-    multiplier = 1 + np.fmod(of_users * USER_FACTOR + times[tied], PRIME - 1)
+    of_users = hash_ids(names.tolist())
+    multiplier = 1 + np.fmod(of_users[places] * USER_FACTOR + times[tied], PRIME - 1)
     ties[tied] = np.fmod(multiplier * (1 + hash_ids(ids.tolist())[items[tied]]), PRIME)
     keys = [users, times, ties, items]
     order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
-    first = np.append(True, np.any([np.diff(key[order]) != 0 for key in keys], axis=0))
+    first = np.append(True, ~np.all([_equal_before(key[order]) for key in keys], axis=0))
     order = order[first & finite[order]]
     if schema.POSITION in rows:  # a list, in its order
         order = order[np.lexsort([rows[schema.POSITION][order], times[order], users[order]])]
@@ -506,7 +511,7 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     columns += [schema.POSITION, schema.SESSION_BEGAN, schema.EXCLUDES_SEEN, _REQUEST]
     for name in columns:
         if name in rows:
-            keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
+            keys += [*np.atleast_2d(rows[name].T)]
     return [rows["row"], *keys[::-1]]
 
 

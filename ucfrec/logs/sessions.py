@@ -23,13 +23,14 @@ from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
 from ucfrec.logs.rows import (
     CANDIDATE_SET,
     CODES,
+    DAY_MS,
     ITEM,
     SESSION,
     USER,
     SortedRows,
     take_rows,
 )
-from ucfrec.logs.tables import glob_pattern, quote
+from ucfrec.logs.tables import cast_integer, glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
 from ucfrec.processes import Progress
 
@@ -48,7 +49,6 @@ EPISODE_USERS = "episode_users.parquet"
 ID_TABLES = ((schema.USER_ID, "users", USERS_FILE), (schema.ITEM_ID, "items", ITEMS_FILE))
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
 _BINS = 2**16
-_NEIGHBOURS = slice(None, -1), slice(1, None)
 
 
 @dataclass(frozen=True)
@@ -120,15 +120,21 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
     """Cut the rows into episodes, some thousand rows at a time."""
     for batch in rows.file.read():
         users, times = batch[USER], batch[schema.TIMESTAMP]
+        latest = times[:-1]
+        if rows.has_lists:
+            # The time of a decision is that of its first row.
+            firsts = np.flatnonzero(batch[schema.PLACE] == 0)
+            sizes = np.diff(firsts, append=len(times))
+            times = batch[schema.TIMESTAMP] = np.repeat(np.minimum.reduceat(times, firsts), sizes)
         user_ends = np.append(users[1:] != users[:-1], True)
         ends, last_ends = user_ends, np.full(len(users), cut.session_by == schema.SESSION_ID)
         if cut.session_by == "gap":
-            pause = times[1:] - times[:-1] > cut.gap_ms
+            pause = times[1:] - latest > cut.gap_ms
             if schema.SESSION_BEGAN in batch:
-                previous, began = (batch[schema.SESSION_BEGAN][part] for part in _NEIGHBOURS)
+                previous, began = (batch[schema.SESSION_BEGAN][n:][: len(pause)] for n in (0, 1))
                 moved = np.abs(began - previous) > schema.CLOCKS_DIFFER_MS
                 # A client that sends its latest rows alone moves the begin, but not past a row.
-                passed = began - times[:-1]
+                passed = began - latest
                 moved &= (passed > schema.CLOCKS_DIFFER_MS) | pause
                 is_other = np.where(previous < 0, passed > 0, moved)
                 pause = np.where(began < 0, pause, is_other | (began == times[1:]))
@@ -140,11 +146,12 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
         if cut.leave_last:
             lengths = np.diff(np.flatnonzero(user_ends), prepend=-1)
             ahead = np.repeat(np.cumsum(lengths), lengths) - np.arange(len(times))
+            # Sessions of one user may overlap.
+            ahead[np.lexsort((times, users))] = ahead.copy()
             splits = (ahead <= cut.leave_last).astype(np.int64) + (ahead <= 2 * cut.leave_last)
             splits *= np.repeat(lengths > 2 * cut.leave_last, lengths)
             # A decision with several rows is not cut.
-            places = np.arange(len(times)) - batch.get(schema.PLACE, 0)
-            splits = splits[places]
+            splits = splits[np.arange(len(times)) - batch[schema.PLACE]]
         last = np.flatnonzero(ends | np.append(splits[1:] != splits[:-1], True))
         lengths = np.diff(last, prepend=-1)
         begins_session = np.append(True, ends[last[:-1]])
@@ -165,12 +172,13 @@ def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
 
 
 class Moments:
-    """Number, mean and squared deviations of vectors of one size, in batches, merged by the formula
-    of Chan, Golub and LeVeque (1983), whose rounding errors do not grow with the mean."""
+    """Number, extremes, mean and squared deviations of vectors of one size, in batches, by the
+    formula of Chan, Golub and LeVeque (1983), whose rounding errors do not grow with the mean."""
 
     def __init__(self, size: int) -> None:
         self.count = 0
         self.mean = np.zeros(size)
+        self.lowest, self.highest = np.full(size, np.inf), np.full(size, -np.inf)
         self._deviations = np.zeros((size, size))
 
     def add(self, *entries: Array) -> None:
@@ -178,6 +186,8 @@ class Moments:
         batch = np.array(entries, dtype=np.float64)
         if not batch.shape[1]:
             return
+        self.lowest = np.minimum(self.lowest, batch.min(axis=1))
+        self.highest = np.maximum(self.highest, batch.max(axis=1))
         mean = batch.mean(axis=1)
         centred = batch - mean[:, None]
         apart = mean - self.mean
@@ -205,12 +215,12 @@ class StepCounts:
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
     rewards: Moments = field(default_factory=lambda: Moments(1))
-    lowest: float = np.inf
-    highest: float = -np.inf
     returns: Moments = field(default_factory=lambda: Moments(2))
     """Of training steps: rewards and number of steps from there to the end of the episode."""
     long_rows: int = 0
     """Rows of episodes that are dropped as too long."""
+    beyond_a_day: int = 0
+    """Number of episodes that last longer than a day."""
     unknown_propensities: int = 0
     not_above_0: int = 0
     above_1: int = 0
@@ -229,10 +239,10 @@ class StepCounts:
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
-        self.lowest = min(self.lowest, float(rewards.min()))
-        self.highest = max(self.highest, float(rewards.max()))
         training = np.repeat(episodes.splits == 0, episodes.lengths)
         ends = np.cumsum(episodes.lengths)
+        spans = times[ends - 1] - times[ends - episodes.lengths]
+        self.beyond_a_day += int(np.count_nonzero(spans > DAY_MS))
         ahead = np.repeat(ends, episodes.lengths) - np.arange(len(rewards))
         earned = np.append(0.0, np.cumsum(rewards))
         return_to_go = np.repeat(earned[ends], episodes.lengths) - earned[:-1]
@@ -246,9 +256,9 @@ class StepCounts:
             self.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
             self.not_above_0 += int(np.count_nonzero(propensities <= 0))
             self.above_1 += int(np.count_nonzero(propensities > 1))
-            lowest, highest = np.fmin.reduce(propensities), np.fmax.reduce(propensities)
-            self.lowest_propensity = float(np.fmin(self.lowest_propensity, lowest))
-            self.highest_propensity = float(np.fmax(self.highest_propensity, highest))
+            lowest, highest = self.lowest_propensity, self.highest_propensity
+            self.lowest_propensity = float(np.fmin.reduce(propensities, initial=lowest))
+            self.highest_propensity = float(np.fmax.reduce(propensities, initial=highest))
 
 
 def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
@@ -258,9 +268,8 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
     has_items = log.key == schema.ITEM_ID
     n_items = log.one("SELECT count(*) FROM item_codes")[0] if has_items else 0
     counts = StepCounts(np.zeros(n_items, dtype=np.int64), np.zeros(n_items, dtype=np.int64))
-    names = ("user_code", "split", "steps", "begins_session", "terminated")
     fields = ("users", "splits", "lengths", "begins_session", "terminated")
-    whole_numbers = pa.schema([(name, pa.int64()) for name in names])
+    whole_numbers = pa.schema([(name, pa.int64()) for name in fields])
 
     def count() -> Iterator[pa.RecordBatch]:
         for episodes in read_episodes(rows, cut):
@@ -270,8 +279,8 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
 
     connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
     connection.execute(
-        f"CREATE TEMP TABLE {EPISODES} AS "
-        "SELECT row_number() OVER () - 1 AS episode, user_code, split, steps, "
+        f"CREATE TEMP TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, "
+        "users AS user_code, splits AS split, lengths AS steps, "
         "begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
     )
     connection.execute(
@@ -343,13 +352,12 @@ def number_ids(
         kind = log.find_type(name)
         old = f"SELECT NULL::{kind} AS {name}, 0 AS number, 0 AS train_count WHERE false"
         if store is not None:
-            # Ids may be integers in the store and text in the log, or vice versa: 07 is not 7.
-            cast = f"TRY_CAST({name} AS {kind})"
-            same = f"CAST({cast} AS VARCHAR) = CAST({name} AS VARCHAR)"
+            # Ids may be integers in the store and text in the log, or vice versa.
+            value = cast_integer(name) if kind == "BIGINT" else f"CAST({name} AS VARCHAR)"
             options = "file_row_number = true, hive_partitioning = false"
             source = f"read_parquet({quote(glob_pattern(store / file))}, {options})"
             old = (
-                f"SELECT CASE WHEN {same} THEN {cast} END AS {name}, file_row_number AS number, "
+                f"SELECT {value} AS {name}, file_row_number AS number, "
                 f"{'' if grows else '0 AS '}train_count FROM {source}"
             )
             if not grows:
@@ -388,11 +396,11 @@ def write_ids(log: TypedLog, folder: Path, offers: "Offers | None") -> dict[str,
         if name not in log.columns:
             continue
         rows = log.connection.sql(f"SELECT * EXCLUDE number FROM {table} ORDER BY number")
-        write_batches(folder / file, rows.to_arrow_reader(BATCH_ROWS))
-        digest = hashlib.sha256()
-        query = f"SELECT {name} FROM {table} ORDER BY number"
-        for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
-            digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
+        batches, digest = rows.to_arrow_reader(BATCH_ROWS), hashlib.sha256()
+        with pq.ParquetWriter(folder / file, batches.schema) as writer:
+            for batch in batches:
+                writer.write_batch(batch)
+                digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
         digests[name] = [digest.hexdigest()]
     if offers is not None:
         offers.save(folder / OFFERS)

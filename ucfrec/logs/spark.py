@@ -14,7 +14,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import ceil
@@ -112,9 +112,7 @@ def sort_with_spark(
         _save(spark, spark.sql(order_rows(log, FAULTY)), scratch / _SORTED)
         counts = dict(spark.sql(FAULT_COUNTS).collect())
     for table in code_tables(log).values():
-        log.connection.register("loaded", dataset(scratch / table))
-        log.connection.execute(f"CREATE TABLE {table} AS SELECT * FROM loaded")
-        log.connection.unregister("loaded")
+        log.connection.from_arrow(dataset(scratch / table)).create(table)
     names = ["row", schema.OBSERVATION]
     observations = _read_parts(scratch / FAULTY, log.batch_rows, names)
     batches = _read_parts(scratch / _SORTED, log.batch_rows)
@@ -185,21 +183,11 @@ def _read_parts(
             yield from file.iter_batches(rows, columns=columns, use_threads=False)
 
 
-@dataclass(frozen=True)
-class UserLog:
-    """A log whose users are read in parts."""
-
-    paths: Sequence[str | Path]
-    """Log files, folders and globs, which every worker sees."""
-    mapping: LogMapping
-    reward: str
-    """Scalar SQL expression over the files' columns."""
-    session_by: str | None
-    """As of `LogTables`."""
-
-
 def map_users(
-    source: UserLog,
+    paths: Sequence[str | Path],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
     folder: Path,
     master: str,
     work: Work,
@@ -211,15 +199,13 @@ def map_users(
     be used, no row is left, or Spark is missing or fails.
     """
     # Workers have a working folder of their own.
-    files = [file.absolute() for file in log_files(source.paths)]
+    files = [file.absolute() for file in log_files(paths)]
     with (
         scratch_folder(folder.absolute(), "users") as scratch,
         engine(files, scratch) as connection,
         spark_session(master) as spark,
     ):
-        tables = open_log_tables(
-            connection, files, source.mapping, source.reward, source.session_by
-        )
+        tables = open_log_tables(connection, files, mapping, reward, session_by)
         log, rows = _type_rows(spark, tables, None, scratch)
         log.require_items()
         faults = dict(rows.groupBy("fault").count().collect())
@@ -230,8 +216,8 @@ def map_users(
         users = rows.where("fault = 0").repartitionByRange(parts, schema.USER_ID)
         users = users.sortWithinPartitions("row").drop("fault", "row")
         plain = {n: n if n in log.columns else "" for n in (*KEY_COLUMNS, *OPTIONAL_COLUMNS)}
-        mapping = LogMapping(plain, earliest=tables.mapping.earliest)
-        work_on_part = partial(_work_on_part, work, mapping, log.name)
+        columns = LogMapping(plain, earliest=tables.mapping.earliest)
+        work_on_part = partial(_work_on_part, work, columns, log.name)
         done = users.mapInArrow(work_on_part, "part bigint, count bigint")
         counts = [count for _, count in sorted(map(tuple, done.collect()))]
         require_rows(log, len(counts), dropped)

@@ -2,12 +2,11 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 
 from ucfrec import schema
@@ -18,16 +17,14 @@ from ucfrec.logs.engine import bind
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.logs.rows import REASONS, SortedRows
 from ucfrec.logs.sessions import EPISODES, USED_USERS, Cut, StepCounts
-from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
-from ucfrec.logs.typed import ROWS, TypedLog
+from ucfrec.logs.tables import quote, quote_name
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
 MANY = 0.2
 """Share of faulty rows above which there is a warning."""
 FEW_IDS = 20
 MOST_UNKNOWN = 0.9
 """Share of unknown users or items, of `FEW_IDS` or more, from which on there is a warning."""
-_NAMED = 5
-"""Users of the longest sessions that are named."""
 _CLOCK_HINT = (
     "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000', "
     "microseconds with 'COLUMN / 1000', nanoseconds with 'COLUMN / 1000000', times such as "
@@ -76,6 +73,7 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "decisions": counts.decisions if counts.decisions < counts.steps else None,
         "episodes": sum(split["episodes"] for split in splits.values()),
         "sessions": sessions,
+        "sessions_beyond_a_day": counts.beyond_a_day,
         "sessions_cut": unfinished - censored,
         "sessions_censored": censored,
         "return_length_share": float(both**2 / (return_to_go * ahead)) if varies else None,
@@ -85,8 +83,8 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "reward_statistics": {
             "mean": float(counts.rewards.mean[0]),
             "std": float(np.sqrt(counts.rewards.covariance[0, 0])),
-            "min": counts.lowest,
-            "max": counts.highest,
+            "min": counts.rewards.lowest[0],
+            "max": counts.rewards.highest[0],
         },
     }
     if log.key == schema.ITEM_ID:
@@ -187,16 +185,6 @@ def require_rows(
     )
 
 
-def note_constant(rows: SortedRows) -> None:
-    """Warn if all usable rows have the same reward."""
-    if rows.lowest == rows.highest:
-        warn_user(
-            f"{rows.log.name}: all {rows.count:,} rewards equal {rows.lowest:g}: policies learn "
-            "what users choose next, not what rewards them; for that, choose another reward "
-            "expression"
-        )
-
-
 def note_dropped(
     name: str,
     dropped: Mapping[str, int],
@@ -230,35 +218,41 @@ def note_unknown(
     )
 
 
-def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None:
-    """Warn of a reason that drops over a fifth of the rows, and of undefined `where`."""
+def note_losses(rows: SortedRows, reward: str, where: str | None, is_new: bool) -> None:
+    """Warn of reasons that drop over a fifth of the rows, undefined `where`, and equal rewards."""
     log = rows.log
+    if is_new and rows.lowest == rows.highest:
+        _note(
+            rows,
+            f"all {rows.count:,} rewards equal {rows.lowest:g}: policies learn what users choose "
+            "next, not what rewards them; for that, choose another reward expression",
+        )
     if where is not None and rows.dropped["left_out"]:
-        note_undefined(log.connection, log.tables, where)
+        note_undefined(log, where)
     n_wanted = rows.read - rows.dropped["left_out"]
     for reason, n in rows.dropped.items():
         if n <= MANY * n_wanted or reason == "left_out":
             continue
         why = f"{REASONS[reason]}; {_REMEDIES.get(reason)}"
         if reason == "reward_not_finite":
-            why = f"the reward {reward} is {_explain_missing(log, reward, where or 'true')}"
+            why = f"the reward {reward} is {_explain_missing(log, reward, where)}"
         elif reason == "null_key":
-            names = [schema.USER_ID, log.key, schema.TIMESTAMP]
-            names += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
-            aggregates = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
-            counts = zip(names, log.one(f"SELECT {aggregates} FROM {ROWS}"), strict=True)
+            aggregates = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in log.required)
+            counts = zip(log.required, log.one(f"SELECT {aggregates} FROM {ROWS}"), strict=True)
             missing = ", ".join(f"{name} in {count:,}" for name, count in counts if count)
             why = f"{REASONS[reason]} ({missing}); {_REMEDIES[reason]}"
         _note(rows, f"{n:,} of {n_wanted:,} rows ({n / n_wanted:.0%}) are dropped: {why}")
 
 
-def _explain_missing(log: TypedLog, reward: str, where: str) -> str:
+def _explain_missing(log: TypedLog, reward: str, where: str | None) -> str:
     """Why the reward is undefined, and what to do."""
     counts = Counter[str]()
     for table in log.tables:
         bound = bind(log.connection, table, "for the reward", reward)
         aggregates = ["count(*)", *(f"count(*) - count({quote_name(n)})" for n in bound.columns)]
-        undefined = f"TRY(CAST({bound.sql} AS DOUBLE)) IS NULL AND ({where}\n)"
+        undefined = f"TRY(CAST({bound.sql} AS DOUBLE)) IS NULL"
+        if where is not None:
+            undefined += f" AND TRY({bind(log.connection, table, 'for --where', where).sql})"
         (_, *nulls) = log.one(f"SELECT {', '.join(aggregates)} FROM {table.sql} WHERE {undefined}")
         for name, n in zip(bound.columns, nulls, strict=True):
             counts[name] += n
@@ -268,28 +262,19 @@ def _explain_missing(log: TypedLog, reward: str, where: str) -> str:
     return "undefined there (NaN, infinite, or a division by zero); give a default by coalesce"
 
 
-def note_undefined(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], where: str
-) -> None:
-    """Warn of rows in which a condition is neither true nor false, which are excluded, too."""
-    undefined = rows = 0
-    for table in tables:
-        bound = bind(connection, table, "for --where", where)
-        aggregates = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
-        source = table.of(bound.columns).sql
-        ((some, every),) = connection.sql(f"SELECT {aggregates} FROM {source}").fetchall()
-        undefined, rows = undefined + some, rows + every
+def note_undefined(log: TypedLog, where: str, rows: str = ROWS) -> None:
+    """Warn of rows (SQL) in which a condition is neither true nor false: they are excluded, too."""
+    undefined, count = log.one(f"SELECT count(*) - count({WANTED}), count(*) FROM {rows}")
     if undefined:
         warn_user(
-            f"{first_and_more([file for table in tables for file in table.files])}: the condition "
-            f"{where} is neither true nor false in {undefined:,} of {rows:,} rows, as a column is "
-            "missing there, and these are excluded; to keep them, write IS DISTINCT FROM for <>, "
-            "or coalesce(…, true) around the condition"
+            f"{log.name}: the condition {where} is neither true nor false in {undefined:,} of "
+            f"{count:,} rows, as a column is missing there, and these are excluded; to keep them, "
+            "write IS DISTINCT FROM for <>, or coalesce(…, true) around the condition"
         )
 
 
 def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMapping) -> None:
-    """Warn of many equal times, of one item only, and of sessions as long as those of bots."""
+    """Warn of many equal times, one item only, parts of sessions, and sessions that seem odd."""
     user = mapping.columns.get(schema.USER_ID, schema.USER_ID)
     if rows.tied > MANY * rows.count and schema.POSITION not in rows.log.columns:
         _note(
@@ -301,6 +286,13 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
     if count := rows.repeated_positions:
         what = "rows repeat a position of their list and count as another one"
         _note(rows, f"{count:,} {what}; give every list a request_id of its own")
+    if rows.dropped["left_out"] and (count := _count_cuts(rows.log, report["session_gap_ms"])):
+        what = "rows that are left out are inside of sessions, whose states and returns lack them"
+        _note(rows, f"{count:,} {what}; if users saw them, leave out whole sessions or users")
+    count, episodes = report["sessions_beyond_a_day"], report["episodes"]
+    if report["session_by"] == schema.SESSION_ID and count > MANY * episodes:
+        what = "sessions last longer than a day, as where ids come again"
+        _note(rows, f"{count:,} of {episodes:,} {what}; give each an id of its own")
     if report.get("items") == 1:
         _note(
             rows,
@@ -319,7 +311,7 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
     (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES} WHERE split = 0")
     longest = rows.log.connection.sql(
         f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
-        f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"
+        f"ORDER BY longest DESC, code DESC LIMIT 5"
     ).fetchall()
     if longest:
         bots = ", ".join(f"{name} ({steps:,} rows)" for name, steps in longest)
@@ -332,6 +324,20 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
             f"sessions of more than {LONG} times that, as bots have: {bots}; leave them out with "
             f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
         )
+
+
+def _count_cuts(log: TypedLog, gap_ms: int | None) -> int:
+    """Number of rows left out at the time of another row of the session, or between two."""
+    by_session = log.session_by == schema.SESSION_ID
+    keys = f"{schema.USER_ID}, {schema.SESSION_ID}" if by_session else schema.USER_ID
+    within = "following IS NOT NULL" if gap_ms is None else f"following - since <= {gap_ms}"
+    query = (
+        f"SELECT count(*) FROM (FROM {ROWS} WHERE {WANTED} IS NOT TRUE) ASOF JOIN ("
+        f"SELECT {keys}, timestamp, timestamp AS since, lead(timestamp) OVER (PARTITION BY {keys} "
+        f"ORDER BY timestamp) AS following FROM {ROWS} WHERE {WANTED}) "
+        f"USING ({keys}, timestamp) WHERE timestamp = since OR {within}"
+    )
+    return int(log.one(query)[0])
 
 
 def _note(rows: SortedRows, message: str) -> None:

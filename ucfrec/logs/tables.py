@@ -25,7 +25,8 @@ from ucfrec.files.parquet import require_plausible_rows
 
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
-_NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
+_NARROW = re.compile(r"^(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)$")
+_WIDE = re.compile(r"^(UBIGINT|DECIMAL\(\d+,0\))((?:\[\d*\])*)$")
 _NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
 _EXACT = {"BIGINT": "DOUBLE", "DATE": "TIMESTAMP", "TIMESTAMP": "TIMESTAMP WITH TIME ZONE"}
 """DuckDB type of a CSV column to the type that keeps what a cast to it would cut off."""
@@ -37,8 +38,7 @@ _MAX_FAULT = 300
 """Most characters of a message of DuckDB, which may quote values of any length."""
 _MOST_NESTED = 32
 """Most levels of a Parquet column; a list is two, and DuckDB's time doubles with each list."""
-_NESTED_TOO_DEEP = "schema too deeply nested"
-"""Arrow's words."""
+_NESTED_TOO_DEEP = "schema too deeply nested"  # Arrow's words
 NOTHING = '"NULL"'
 """DuckDB type of a column without any value."""
 ISO_TIME = (
@@ -165,10 +165,9 @@ def _folder_value(name: str, kind: str = "VARCHAR") -> str:
 
 def _wider_type(kind: str) -> str:
     """The type that expressions compute with: DuckDB multiplies 8 bits in 8 bits, and subtracts
-    unsigned numbers without a sign; where that overflows, a reward would be undefined."""
-    if kind == "UBIGINT":
-        return "HUGEINT"
-    return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
+    unsigned numbers without a sign; where that overflows, a reward would be undefined. Decimals
+    without a fraction are whole numbers, as some databases write them."""
+    return _NARROW.sub(r"BIGINT\2", _WIDE.sub(r"HUGEINT\2", kind))
 
 
 def glob_pattern(file: Path) -> str:
@@ -185,6 +184,12 @@ def quote(value: str) -> str:
 def quote_name(name: str) -> str:
     """`name` as a SQL identifier."""
     return '"' + name.replace('"', '""') + '"'
+
+
+def cast_integer(text: str) -> str:
+    """SQL of the BIGINT that a text (SQL) is written as; NULL for others: 007 is not 7."""
+    number = f"TRY_CAST({text} AS BIGINT)"
+    return f"CASE WHEN CAST({number} AS VARCHAR) = CAST({text} AS VARCHAR) THEN {number} END"
 
 
 def first_and_more(files: Sequence[Path]) -> str:
@@ -290,10 +295,6 @@ def _columns(
         if not is_parquet:
             return None
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
-    if "\\" in str(file) and glob.has_magic(str(file)):
-        raise InputError(
-            f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
-        )
     source = Table((file,), ()).source
     try:
         if is_parquet:

@@ -1,6 +1,5 @@
 """A log as one relation of typed rows: its columns, its vectors, its times, its reward."""
 
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from ucfrec.logs.tables import (
     NOTHING,
     WHOLE,
     Table,
+    cast_integer,
     cast_timestamp,
     first_and_more,
     is_integer,
@@ -43,20 +43,19 @@ WANTED = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
 VECTORS = (schema.ACTION, schema.OBSERVATION)
 _BATCH_BYTES = 2**25
-_IS_INTEGER = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
-"""SQL of whether a text `x` is as the integer that it means is written."""
 _IDS = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID, schema.REQUEST_ID)
+AVAILABLE = ("available_from", "available_until")
+_TIMES = (schema.TIMESTAMP, schema.SESSION_BEGAN, *AVAILABLE)
 _TYPES = {
     **dict.fromkeys(_IDS, "VARCHAR"),
-    schema.TIMESTAMP: "BIGINT",
     schema.ACTION: "FLOAT[]",
     schema.OBSERVATION: "FLOAT[]",
     schema.PROPENSITY: "FLOAT",
     schema.IS_RANDOM: "BOOLEAN",
     schema.POSITION: "DOUBLE",
-    schema.SESSION_BEGAN: "BIGINT",
     schema.EXCLUDES_SEEN: "BOOLEAN",
     schema.CANDIDATES: "VARCHAR",
+    **dict.fromkeys(_TIMES, "BIGINT"),
 }
 KEY_OF_LIST = "CASE WHEN len({0}) > 0 THEN CAST(hash({0}) AS VARCHAR) END"
 """SQL of the name of a set of candidates that is a list in the log."""
@@ -113,6 +112,12 @@ class TypedLog:
     def key(self) -> str:
         """Column of the choice: `item_id` or `action`."""
         return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Columns that no row may lack."""
+        keys = schema.USER_ID, self.key, schema.TIMESTAMP
+        return (*keys, schema.SESSION_ID) if self.session_by == schema.SESSION_ID else keys
 
     @property
     def batch_rows(self) -> int:
@@ -220,13 +225,10 @@ def measure_vectors(log: TypedLog, survey: Sequence[tuple[int, ...]]) -> TypedLo
         if name in log.columns:
             ends = [n for row in survey for n in row[2 * place : 2 * place + 2] if n is not None]
             least, sizes[name] = min(ends, default=0), max(ends, default=0)
-            if least < sizes[name]:
+            if not 0 < least == sizes[name]:
                 raise InputError(
-                    f"{name} has lists of unequal length, {least} to {sizes[name]}; make them equal"
-                )
-            if not least:
-                raise InputError(
-                    f"{name} is empty in every row; map another column or --column {name}="
+                    f"{name} has lists of {least} to {sizes[name]} numbers; make them equally "
+                    f"long, map another column or --column {name}="
                 )
     if bad := sum(row[-1] for row in survey):
         raise InputError(
@@ -245,11 +247,10 @@ def not_finite(vector: str) -> str:
 
 _REWARD = "for the reward; name it with --reward, or give --reward 1 if users chose every row"
 _Values = dict[str, tuple[str, str]]
-"""Log column to its (SQL, DuckDB type)."""
 
 
 def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Table, _Values]:
-    """A table with the columns that are read, and the typed values of these."""
+    """A table with the columns that are read, and the (SQL, DuckDB type) of each log column."""
     connection, mapping = log.connection, log.mapping
     texts = {name: text_of_column(connection, table, mapping, name) for name in columns}
     time_format = None if table.of_exposures else mapping.time_format
@@ -278,7 +279,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Tab
         if condition.kind != "BOOLEAN":
             remedy = "write a condition, e.g. user_id <> 'bot'"
             raise wrong_type(table, "--where", mapping.where, condition.kind, remedy)
-        extra[WANTED] = (f"coalesce(TRY({condition.sql}), false)", "BOOLEAN")
+        extra[WANTED] = (f"TRY({condition.sql})", "BOOLEAN")
         sources.append(condition)
     narrow = table.of((column for value in sources for column in value.columns), raw.values())
     values = {
@@ -295,14 +296,12 @@ def _bind_reward(
     try:
         return table, bind(connection, table, _REWARD, reward)
     except InputError:
-        words = re.findall(r"\w+", reward.casefold())
-        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in words]
-        if not texts:
-            raise
-        counts = ", ".join(f"count({quote_name(name)})" for name in texts)
-        (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
-        empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
-        table = replace(table, types=tuple((dict(table.types) | empty).items()))
+        kinds, words = dict(table.types), reward.casefold()
+        for name in (n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in words):
+            query = f"SELECT 1 FROM {table.sql} WHERE {quote_name(name)} IS NOT NULL LIMIT 1"
+            if not connection.sql(query).fetchall():
+                kinds[name] = NOTHING
+        table = replace(table, types=tuple(kinds.items()))
         return table, bind(connection, table, _REWARD, reward)
 
 
@@ -320,7 +319,7 @@ def cast_value(
     if kind.removesuffix("[]") == NOTHING:
         return nothing, NOTHING
     # Of times as DOUBLE, a rounded nanosecond is none of the milliseconds.
-    inexact = {schema.TIMESTAMP: ("FLOAT",), **dict.fromkeys(_IDS, WHOLE)}.get(name, ())
+    inexact = {**dict.fromkeys(_TIMES, ("FLOAT",)), **dict.fromkeys(_IDS, WHOLE)}.get(name, ())
     for column in (column for column in bound.columns if table.columns[column] in inexact):
         real = table.columns[column]
         with explain_errors(connection, (table,)):
@@ -337,19 +336,23 @@ def cast_value(
     if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
-        remedy = f"use integers or text, e.g. --column {name}='({expression})::BIGINT'"
+        cast = "BIGINT" if is_number(kind) else "VARCHAR"
+        remedy = f"use integers or text, e.g. --column {name}='({expression})::{cast}'"
         if is_number(kind):
             remedy += ", if all are whole numbers of at most 15 digits: others would be rounded"
-    elif name in (schema.TIMESTAMP, schema.SESSION_BEGAN):
+        elif kind.endswith("]"):
+            remedy = "use integers or text, and a row for every entry of a list"
+    elif name in _TIMES:
         if is_number(kind) and time_format is None:
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
         if is_number(kind):
             sql, kind = f"CAST(TRY_CAST({sql} AS BIGINT) AS VARCHAR)", "VARCHAR"
         if kind == "VARCHAR":
-            return cast_text_time(connection, table, sql, expression, time_format), "BIGINT"
+            what = f"{name} ({expression})"
+            return cast_text_time(connection, table, sql, what, time_format), "BIGINT"
         if time := cast_timestamp(sql, kind):
             return f"TRY(epoch_ms({time}))", "BIGINT"
-        remedy = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
+        remedy = "use milliseconds, a date or a timestamp"
     elif name in (schema.ACTION, schema.OBSERVATION):
         if is_vector(kind):
             return f"TRY_CAST({sql} AS FLOAT[])", "FLOAT[]"
@@ -385,24 +388,22 @@ def _unify_ids(
     name: str,
     as_text: bool,
 ) -> None:
-    """Cast ids to BIGINT if every file has integers that fit and, in a CSV file, are written as
+    """Cast ids to BIGINT if every file has integers of 64 bits that, in a CSV file, are written as
     integers are (not 007, 7.0 or 1e1), else or with `as_text` to text."""
     whole, some_whole, with_decimals = not as_text, False, None
     for table, values in selects:
         sql, kind = values[name]
         # The type that DuckDB inferred for a column of a CSV file, whose text is read.
-        raw = (column for column in table.raw if quote_name(raw_name(column)) == sql)
-        csv_type = next((dict(table.types)[column] for column in raw), None)
-        all_integers = is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT")
-        if csv_type is not None:
+        csv_type = next((t for name, t in table.types if quote_name(raw_name(name)) == sql), None)
+        all_integers = is_integer(kind)
+        if csv_type is not None or kind in ("UBIGINT", "HUGEINT", "UHUGEINT"):
             with explain_errors(connection, (table,)):
                 ((any_integer, all_integers),) = connection.sql(
-                    f"SELECT coalesce(bool_or({_IS_INTEGER}), false), "
-                    f"coalesce(bool_and({_IS_INTEGER}), true) "
-                    f"FROM (SELECT {sql} AS x FROM {table.sql}) WHERE x IS NOT NULL"
+                    "SELECT count(x) > 0, count(x) = count(*) FROM (SELECT "
+                    f"{cast_integer(sql)} AS x FROM {table.sql} WHERE {sql} IS NOT NULL)"
                 ).fetchall()
-            some_whole |= is_integer(csv_type) or (csv_type == "DOUBLE" and any_integer)
-        some_whole |= is_integer(kind)
+            some_whole |= csv_type == "DOUBLE" and any_integer
+        some_whole |= is_integer(csv_type or kind)
         if (csv_type or kind) == "DOUBLE":
             with_decimals = with_decimals or table
         whole &= kind == NOTHING or all_integers
@@ -422,7 +423,7 @@ def cast_text_time(
     connection: duckdb.DuckDBPyConnection,
     table: Table,
     sql: str,
-    column: str,
+    what: str,
     time_format: str | None,
 ) -> str:
     """SQL of the milliseconds since 1970 (UTC) that a column of text means, NULL where it is none.
@@ -442,9 +443,11 @@ def cast_text_time(
             ((n_times, strange),) = connection.sql(query).fetchall()
         if n_times or strange is None:
             continue
+        remedy = "say how it is written with --time-format, e.g. '%d/%m/%Y %H:%M'"
+        if what.startswith(AVAILABLE):
+            remedy = "write one of these, or nothing for no bound"
         raise InputError(
-            f"{file}: timestamp ({column}) is {strange!r:.60}, no ISO 8601 time nor "
-            "milliseconds; say how it is written with --time-format, e.g. '%d/%m/%Y %H:%M'"
+            f"{file}: {what} is {strange!r:.60}, no ISO 8601 time nor milliseconds; {remedy}"
         )
     plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
     # DuckDB reads no zone after a blank.

@@ -297,7 +297,7 @@ class HistoryReader(NamedTuple):
             raise InputError("the policy needs the last observation; give a row of history with it")
         items = id_array([row["item_id"] for row in rows])
         columns = {
-            "user": np.zeros(len(rows), dtype=np.int64),
+            "user": np.repeat(id_array([user_id]), len(rows)),
             schema.TIMESTAMP: np.asarray(_read_times(rows), dtype=np.int64),
             schema.ITEM: items,
             "row": np.arange(len(rows)),
@@ -317,7 +317,7 @@ class HistoryReader(NamedTuple):
             if {*map(len, observed)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
-        order = choose_rows(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
+        order = choose_rows(columns, self.duplicates)[-LONGEST_HISTORY:]
         observations = None
         if self.observation_size:
             latest = int(order[-1])

@@ -14,7 +14,7 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark import UserLog, map_users
+from ucfrec.logs.spark import map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import session_by
 from ucfrec.recommending.recommend import decide
@@ -55,13 +55,13 @@ def recommend_with_spark(
     recommended: Any = partial(decide, **how)
     recommended(trained, ())  # checks the arguments
     columns = columns_used(trained, mapping)
-    log = UserLog(files, columns, reward_of(trained), session_by(trained))
+    reward, by = reward_of(trained), session_by(trained)
     with ExitStack() as stack:
         folders = [out] if exposures is None else [out, exposures]
         parts = [stack.enter_context(atomic_folder(folder)).absolute() for folder in folders]
         run = RunOnWorkers(trained.folder.absolute(), checkpoint, trained.fingerprint)
         work = partial(_recommend_part, run, parts, memory_limit, recommended)
-        return sum(map_users(log, parts[0].parent, master, work))
+        return sum(map_users(files, columns, reward, by, parts[0].parent, master, work))
 
 
 def _recommend_part(

@@ -250,12 +250,13 @@ def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path
         report = validate(paths, LogMapping())
     assert report["session_by"] == "gap"
     notes = [str(note.message) for note in told if note.category is InputNote]
-    assert [note.partition(" is ")[0] for note in notes] == ["session_id", "is_random"]
+    assert [note.partition(" is ")[0] for note in notes[:2]] == ["session_id", "is_random"]
     assert f"only 1 of 3 files have it ({paths[1]})" in notes[0]
+    assert "users have 24.0 rows, but sessions 1.2, and policies do not see earlier" in notes[2]
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
-        validate(paths, LogMapping({"session_id": "", "is_random": ""}))
-        validate([paths[1]], LogMapping())
+        for files, columns in ((paths, {"session_id": "", "is_random": ""}), (paths[1:2], {})):
+            validate(files, LogMapping(columns), PrepareOptions(session_by="user"))
 
 
 @pytest.mark.parametrize("folder", ["logs [1]", "a*b?", "it's {x,y}", "~", "$HOME"])

@@ -81,8 +81,7 @@ def append_logs(
 
     Returns the counts of `prepare` on the new logs, with `new_users` and `new_items` (numbers of
     ids), `new_user_steps` and `new_item_steps` (steps that have them), and `expired_steps`. Raises
-    InputError if the logs cannot be used or leave nothing to validate or test on, or `out` is
-    another store.
+    InputError if the logs cannot be used or leave nothing to test on, or `out` is another store.
     """
     options, mapping = options or AppendOptions(), mapping or LogMapping()
     files, old = log_files(paths), StoreRecord.read(store)
@@ -231,9 +230,9 @@ def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
     """Check that there are rows to choose a rule and to compare on."""
     for split in ("validation", "test"):
         if not report["splits"][split]["episodes"]:
+            rows = f"{report['steps']:,}, in {report['sessions']:,} session(s)"
             raise InputError(
-                f"{name}: the new rows ({report['steps']:,}, in "
-                f"{report['sessions']:,} session(s)) leave no {split} rows, to choose a rule and "
+                f"{name}: the new rows ({rows}) leave no {split} rows, to choose a rule and "
                 "compare the runs on; give more rows, or another --split"
             )
 

@@ -379,8 +379,7 @@ def encode_features(
     ids: str,
     id_column: str,
 ) -> "sparse.csr_matrix | None":
-    """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`; None if
-    there are none.
+    """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`, or None.
 
     Numbers are standardised and clipped, 0 where missing; categories and tags are one-hot. Means,
     deviations and the kept categories are of training rows. InputError if vectors differ in length.

@@ -294,19 +294,12 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
         what = "sessions last longer than a day, as where ids come again"
         _note(rows, f"{count:,} of {episodes:,} {what}; give each an id of its own")
     if report.get("items") == 1:
-        _note(
-            rows,
-            f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
-            "between; check --column item_id and --where",
-        )
-    users, sessions, steps = (report[name] for name in ("users", "sessions", "steps"))
-    if sessions > 2 * users and steps < 2 * sessions:
-        _note(
-            rows,
-            f"users have {steps / users:.1f} rows, but sessions {steps / sessions:.1f}, and "
-            "policies do not see the rows before a session; for ratings, purchases and the like, "
-            "say --session-by user",
-        )
+        what = f"all {report['steps']:,} rows show the same item, so there is nothing to choose"
+        _note(rows, f"{what} between; check --column item_id and --where")
+    of_user, of_session = (report["steps"] / report[name] for name in ("users", "sessions"))
+    if of_user > 2 * of_session and of_session < 2:
+        what = f"users have {of_user:.1f} rows, but sessions {of_session:.1f}, and policies do not"
+        _note(rows, f"{what} see earlier ones; for ratings or purchases, say --session-by user")
     # Of training, because held-out episodes may be the last row of each user.
     (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES} WHERE split = 0")
     longest = rows.log.connection.sql(

@@ -128,8 +128,7 @@ class SequencePolicy(nn.Module, ABC):
         seed: int,
     ) -> EpisodeStore:
         """The episodes to train on, derived from the training episodes; by default the share
-        `best_share` of them with the highest returns. The folder keeps intermediate results of a
-        resumed run."""
+        `best_share` of them with the highest returns. The folder keeps intermediate results."""
         if config.best_share == 1:
             return train
         count = int(np.ceil(config.best_share * train.n_episodes))
@@ -139,8 +138,7 @@ class SequencePolicy(nn.Module, ABC):
     def begin_with_items(self) -> None:
         """Let items say more than their places at the begin of a training: embeddings of places
         are small, and products with item vectors are not divided by √d, so that these, which begin
-        near 0, learn as fast as the rest. Where items come and go, the vectors of new ones would be
-        noise."""
+        near 0, learn as fast as the rest. Vectors of items that come and go would be noise."""
         for name, module in self.named_modules():
             if name.endswith(("embed_timestep", "embed_position")):
                 draw_normal(module.weight, std=0.02)

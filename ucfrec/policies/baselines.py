@@ -489,8 +489,7 @@ class BoostedPolicy(ScoringPolicy):
         counts: Tensor | None = None,
     ) -> Tensor:
         """Inputs (B, C, F) of the trees for items (C,) or (B, C) at the windows' last steps, whose
-        action and reward are not read; counts (2, B, C) of shown and liked ones, or None for all
-        rows."""
+        action and reward are not read; counts (2, B, C) of shown and liked ones, None for all."""
         valid = windows.mask[:, :-1].float()  # (B, N)
         earlier = windows.actions[:, :-1]
         liked = self._find_liked(windows)[:, :-1]
@@ -602,7 +601,11 @@ def _fit_pairs(
     return predicted, solve(folds >= 0)
 
 
-def _best_number(trees: BoostedTrees, inputs: Array, liked: BoolArray) -> int:
+def _best_number(
+    trees: BoostedTrees,
+    inputs: Array,
+    liked: BoolArray,
+) -> int:
     """How many of the trees have the lowest log loss at held-out steps."""
     losses = torch.zeros(())
     for begin in range(0, len(inputs), _ROWS_AT_ONCE):

@@ -30,7 +30,11 @@ _ROUNDING = 1e-4
 
 @random_state_kept()
 @torch.no_grad()
-def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str, int]) -> None:
+def check_policy(
+    policy: SequencePolicy,
+    train: EpisodeStore,
+    sizes: Mapping[str, int],
+) -> None:
     """Check a policy with forward passes that differ in what it must not read.
 
     Row t of `features` predicts a_t. It may depend on what was known before: states and

@@ -17,8 +17,7 @@ _AT_ONCE = 2**24
 
 
 class Proposal:
-    """Draws items with probability Q: half in proportion to training counts (n_items,) above 0,
-    half evenly.
+    """Draws items with probability Q: half by training counts (n_items,) above 0, half evenly.
 
     By counts alone, items that the logs hardly show but the policy likes would be drawn too rarely
     for their weight; evenly alone, popular items would (`benchmarks/LOG.md`). Equal parts of
@@ -79,8 +78,7 @@ class ItemHead(nn.Module):
     An item's vector is a learned projection of its fixed embedding, which items without training
     steps have too, plus a correction learned per item. The bias begins as the log of the item's
     share of the training steps; `follow` moves it to the shares of the time. With an exposure term,
-    what the session was shown lately moves the logits too; a dot product cannot say "unlike what
-    was just shown".
+    what was shown lately moves the logits too: a dot product cannot say "unlike the last item".
 
     With `samples`, training takes the softmax over items drawn for the batch (`Proposal`) instead
     of all, subtracting the log of their expected number of draws from their logits (Bengio &

@@ -66,8 +66,7 @@ class UCFPaperConfig(UCFConfig):
     """Settings of the policy as read in the paper: attention is supervised."""
 
     lambda_mask: Weight = 0.1
-    """λ, weight of the mask loss, which supervises attention. The paper prints no value; this one
-    is ours."""
+    """λ, weight of the mask loss, which supervises attention; not printed in the paper: ours."""
     exposure: bool = False
     """Whether the logits of items depend on what the session was shown lately."""
     return_to_go: Returns = "session"

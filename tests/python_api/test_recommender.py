@@ -199,7 +199,8 @@ def test_rows_are_warned_of_once_at_the_users_line(
     data = spoil(log)
     with pytest.warns(InputNote, match=says) as noted:
         policy = Recommender("item-rate").fit(data, **options)
-    assert [each.filename for each in noted if issubclass(each.category, InputNote)] == [__file__]
+    files = [each.filename for each in noted if issubclass(each.category, InputNote)]
+    assert files == [__file__] * (2 if options else 1)  # --where cuts sessions
     if not options:
         with pytest.warns(InputNote, match=says) as noted:
             policy.score(data)

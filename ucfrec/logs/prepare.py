@@ -284,7 +284,7 @@ def read_log(
                 }
                 sessions.number_ids(log, features, store, grows)
                 report = {"reward": reward, **summary.build_report(rows, cut, counts)}
-                summary.note_oddities(rows, report, mapping)
+                summary.note_oddities(rows, report, store is None)
                 stage.update()
                 offers, sets = None, None
                 if log.key == schema.ITEM_ID:

@@ -14,7 +14,7 @@ from ucfrec.episodes.record import LONG
 from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind
-from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
+from ucfrec.logs.mapping import EARLIEST_MS
 from ucfrec.logs.rows import REASONS, SortedRows
 from ucfrec.logs.sessions import EPISODES, USED_USERS, Cut, StepCounts
 from ucfrec.logs.tables import quote, quote_name
@@ -273,9 +273,9 @@ def note_undefined(log: TypedLog, where: str, rows: str = ROWS) -> None:
         )
 
 
-def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMapping) -> None:
+def note_oddities(rows: SortedRows, report: Mapping[str, Any], is_new: bool) -> None:
     """Warn of many equal times, one item only, parts of sessions, and sessions that seem odd."""
-    user = mapping.columns.get(schema.USER_ID, schema.USER_ID)
+    user = rows.log.mapping.columns.get(schema.USER_ID, schema.USER_ID)
     if rows.tied > MANY * rows.count and schema.POSITION not in rows.log.columns:
         _note(
             rows,
@@ -297,7 +297,7 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMappi
         what = f"all {report['steps']:,} rows show the same item, so there is nothing to choose"
         _note(rows, f"{what} between; check --column item_id and --where")
     of_user, of_session = (report["steps"] / report[name] for name in ("users", "sessions"))
-    if of_user > 2 * of_session and of_session < 2:
+    if is_new and of_user > 2 * of_session and of_session < 2:
         what = f"users have {of_user:.1f} rows, but sessions {of_session:.1f}, and policies do not"
         _note(rows, f"{what} see earlier ones; for ratings or purchases, say --session-by user")
     # Of training, because held-out episodes may be the last row of each user.

@@ -264,7 +264,7 @@ def read_log(
                     )
                 log = rows.log
                 summary.require_rows(log, rows.count, rows.dropped, store if grows else None)
-                summary.note_losses(rows, reward, mapping.where, store is None)
+                summary.note_losses(rows, reward, mapping.where, store is None, grows)
                 stage.update()
                 split = (1.0, 0.0, 0.0) if evaluates else options.split
                 cut = sessions.Cut(

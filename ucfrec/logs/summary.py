@@ -218,10 +218,10 @@ def note_unknown(
     )
 
 
-def note_losses(rows: SortedRows, reward: str, where: str | None, is_new: bool) -> None:
+def note_losses(rows: SortedRows, reward: str, where: str | None, new: bool, grows: bool) -> None:
     """Warn of reasons that drop over a fifth of the rows, undefined `where`, and equal rewards."""
     log = rows.log
-    if is_new and rows.lowest == rows.highest:
+    if new and rows.lowest == rows.highest:
         _note(
             rows,
             f"all {rows.count:,} rewards equal {rows.lowest:g}: policies learn what users choose "
@@ -231,7 +231,7 @@ def note_losses(rows: SortedRows, reward: str, where: str | None, is_new: bool) 
         note_undefined(log, where)
     n_wanted = rows.read - rows.dropped["left_out"]
     for reason, n in rows.dropped.items():
-        if n <= MANY * n_wanted or reason == "left_out":
+        if n <= MANY * n_wanted or reason in ("left_out", "clock_out_of_range" if grows else ""):
             continue
         why = f"{REASONS[reason]}; {_REMEDIES.get(reason)}"
         if reason == "reward_not_finite":

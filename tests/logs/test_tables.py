@@ -65,6 +65,8 @@ def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     log["user_id"] %= 9
     for user, part in log.groupby("user_id"):
         write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
+    with pytest.raises(InputError, match="no column 'user_id'.*folders name its values"):
+        validate(log_files([tmp_path]), LogMapping())
     given = LogMapping(partitions=True)
     assert validate(log_files([tmp_path]), given)["users"] == log["user_id"].nunique()
     (batch,) = read_histories([tmp_path], given, "reward", 1000)
@@ -79,9 +81,6 @@ def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
         write(log, tmp_path / "numbers" / f"weight={name}" / "part.parquet")
     (batch,) = read_histories([tmp_path / "numbers"], given, "coalesce(weight, 7)", 1000)
     assert {*batch.rewards.tolist()} == {7}
-
-
-# Parts
 
 
 def test_parts_of_a_log_are_joined_by_the_names_of_their_columns(tmp_path: Path) -> None:

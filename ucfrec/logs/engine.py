@@ -224,6 +224,8 @@ def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping
 
 def _missing(table: Table, what: str, name: str) -> InputError:
     hint = nearest(name, list(table.columns))
+    if f"{name}=" in str(table.files[0].parent):
+        hint = "folders name its values: add --partitions"
     return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
 
 

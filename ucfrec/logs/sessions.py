@@ -83,9 +83,8 @@ class Episodes:
     begins_session: BoolArray
     """(E,) false for the later pieces of a session that a split cuts."""
     terminated: BoolArray
-    """(E,) false for episodes cut at a split and for sessions that may have gone on after the log
-    ended: a user's last one if sessions are users, or if it ended within the gap before the end of
-    the log."""
+    """(E,) false for episodes cut at a split and sessions that may have gone on after the log: a
+    user's last one if sessions are users, or if it ended within the gap before the log's end."""
     long_rows: int
     """Rows of episodes that are dropped as too long."""
 

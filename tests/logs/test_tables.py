@@ -33,7 +33,7 @@ def fingerprint(store: Path) -> str:
     return EpisodeStore.open(store).record.fingerprint
 
 
-# Folders
+# Folders and parts
 
 
 @pytest.mark.parametrize(("name", "suffix"), [("user_id", ".csv"), ("timestamp", ".parquet")])
@@ -65,7 +65,7 @@ def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     log["user_id"] %= 9
     for user, part in log.groupby("user_id"):
         write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
-    with pytest.raises(InputError, match="no column 'user_id'.*folders name its values"):
+    with pytest.raises(InputError, match=r"no column 'user_id'.*folders name its values"):
         validate(log_files([tmp_path]), LogMapping())
     given = LogMapping(partitions=True)
     assert validate(log_files([tmp_path]), given)["users"] == log["user_id"].nunique()

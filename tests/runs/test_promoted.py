@@ -98,8 +98,9 @@ def test_a_damaged_run_or_pointer_is_refused(trained: TrainedPolicy, tmp_path: P
     with pytest.raises(InputError, match=r"best\.safetensors"):
         promote(folder / "b", force=True)
     assert current(folder) == "a"
-    outside = {"files": {}, "current": "a", "previous": ["../a"]}
-    for wrong in (outside, {"files": {}, "current": 3}, {"files": {}}):
+    rest = {"files": {}, "fingerprint": "0"}
+    names = [{"current": "a", "previous": ["../a"]}, {"current": "/tmp/a"}, {"current": ".."}]
+    for wrong in (*(rest | name for name in names), rest, {**rest, "current": 3}):
         (folder / POINTER).write_text(json.dumps(wrong))
         with pytest.raises(InputError, match=POINTER):
             promote_back(folder)

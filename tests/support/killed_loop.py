@@ -48,7 +48,7 @@ def promote_often(folder: Path) -> None:
 def promoted_is_whole(folder: Path) -> None:
     found = promoted(folder)
     assert found.current in ("run", "other")
-    TrainedPolicy.load(found.run(folder))
+    TrainedPolicy.load(folder / found.current)
 
 
 def join(folder: Path) -> None:

@@ -178,7 +178,7 @@ class Update(LogOptions, RunArgument):
         from ucfrec.updating.verdict import describe, describe_drift
 
         pointer = None if (self.run / RUN).is_file() else promoted(self.run)
-        run = self.run if pointer is None else pointer.run(self.run)
+        run = self.run if pointer is None else self.run / pointer.current
         old = TrainedPolicy.load(run)
         if pointer is not None:
             pointer.require_same(old)

@@ -4,7 +4,9 @@ The file names the current run and those before it, the latest last.
 """
 
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
+
+from pydantic import Field
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
@@ -13,6 +15,7 @@ from ucfrec.runs.record import RunRecord, verify_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 POINTER = "promoted.json"
+_Name = Annotated[str, Field(strict=True, pattern=r"^\.*[^./][^/]*$")]  # leads to no other folder
 
 
 class Promoted(Record):
@@ -22,15 +25,11 @@ class Promoted(Record):
     KIND: ClassVar[str] = f"a folder of runs that are served: it has no {POINTER}; promote one"
     REMEDY: ClassVar[str] = "promote a run again"
 
-    current: Text
+    current: _Name
     """Name of the run folder, beside the file."""
     fingerprint: Text
     """Of the run as it was promoted."""
-    previous: tuple[Text, ...] = ()
-
-    def run(self, folder: Path) -> Path:
-        """The folder of the current run, in that of the file."""
-        return folder / self.current
+    previous: tuple[_Name, ...] = ()
 
     def require_same(self, trained: TrainedPolicy) -> None:
         """Check that a run of that name is the one that was promoted, or raise InputError."""
@@ -79,7 +78,7 @@ def promote_back(folder: Path) -> Promoted:
         if pointer is None or not pointer.previous:
             raise InputError(f"{folder}: no run was current before; promote one")
         *previous, name = pointer.previous
-        back = pointer.copy_with(current=name).run(folder)
+        back = folder / name
         verify_run(back)
         return _write(back, TrainedPolicy.load(back).fingerprint, tuple(previous))
 
@@ -92,7 +91,7 @@ def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
 def _require_verdict(run: Path, pointer: Promoted) -> None:
     update = RunRecord.read(run).update
     fault = ""
-    current = pointer.run(run.parent)
+    current = run.parent / pointer.current
     if update is None or update.verdict is None:
         fault = f"has no verdict against the current run {current.name}"
     elif update.run != TrainedPolicy.load(current, split=True).fingerprint:

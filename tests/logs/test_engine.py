@@ -418,6 +418,6 @@ def test_errors_of_frames_name_the_frame(frame: pd.DataFrame, said: str) -> None
 
 def test_scratch_folders_may_have_any_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("~y", "a?b", "c%2F[1]"):
+    for name in ("~y", "a?b", "d\\e", "c%2F[1]"):
         with engine([], Path(name)) as connection:
             connection.execute("CREATE TABLE t AS SELECT 1")

@@ -78,8 +78,8 @@ def engine(
     """
     with scratch_folder(folder.absolute(), "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
-        # In the name of a database, DuckDB reads "?" as that of an address.
-        database = f"{work}/rows.duckdb" if work and "?" not in str(work) else ":memory:"
+        # In the name of a database, DuckDB reads "?" and "\\" as those of an address.
+        database = f"{work}/rows.duckdb" if work and not {*"?\\"} & {*str(work)} else ":memory:"
         connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:

@@ -304,7 +304,7 @@ def note_oddities(rows: SortedRows, report: Mapping[str, Any], is_new: bool) -> 
     (median,) = rows.log.one(f"SELECT quantile_disc(steps, 0.5) FROM {EPISODES} WHERE split = 0")
     longest = rows.log.connection.sql(
         f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
-        f"ORDER BY longest DESC, code DESC LIMIT 5"
+        "ORDER BY longest DESC, code DESC LIMIT 5"
     ).fetchall()
     if longest:
         bots = ", ".join(f"{name} ({steps:,} rows)" for name, steps in longest)
